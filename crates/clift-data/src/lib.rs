@@ -42,6 +42,7 @@ pub use scene_source::{SceneSource, Split};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
 
 // Layouts on disk, and synthetic scenes.
+pub use sources::chunks::census::observe_census;
 pub use sources::chunks::chunk_source::ChunkSource;
 pub use sources::chunks::writer::{SceneRecord, write_chunks};
 pub use sources::dataset_root::DatasetRoot;

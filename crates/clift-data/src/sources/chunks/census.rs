@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::UNIX_EPOCH;
 
 use serde::{Deserialize, Serialize};
@@ -14,6 +15,38 @@ use crate::sources::chunks::table::{ChunkTable, SceneTable};
 
 /// Version of the file; other versions are ignored.
 const VERSION: u32 = 1;
+
+/// What is called with the numbers of examined and of all chunks.
+static OBSERVER: OnceLock<fn(usize, usize)> = OnceLock::new();
+
+/// Has `observer` called, for the whole process, while the chunks of a data set are examined: after each chunk, with the
+/// number of examined ones and the number of all, in order. The first opening of a large data set reads every chunk and can
+/// take minutes. Only the first observer counts.
+pub fn observe_census(observer: fn(usize, usize)) {
+    // A second observer is ignored, as documented.
+    let _ = OBSERVER.set(observer);
+}
+
+/// Counts examined chunks.
+pub(crate) struct Progress {
+    done: Mutex<usize>,
+    total: usize,
+}
+
+impl Progress {
+    pub fn of(total: usize) -> Self {
+        Self { done: Mutex::new(0), total }
+    }
+
+    pub fn advance(&self) {
+        // Locked during the call, so that numbers arrive in order.
+        let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
+        *done += 1;
+        if let Some(observer) = OBSERVER.get() {
+            observer(*done, self.total);
+        }
+    }
+}
 
 /// Scenes of a chunk.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

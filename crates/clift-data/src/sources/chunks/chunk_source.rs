@@ -12,7 +12,7 @@ use crate::image::codec::decode_image;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on};
-use crate::sources::chunks::census::{Census, ChunkCensus, SceneCensus};
+use crate::sources::chunks::census::{Census, ChunkCensus, Progress, SceneCensus};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::filters::SceneFilters;
@@ -142,7 +142,11 @@ impl ChunkSource {
     fn take_census(&mut self, path: &Path, needs_fov: bool) {
         let name = |chunk: &Chunk| chunk.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let cached = Census::read(path).chunks;
-        let examine = |chunk: &mut Chunk| chunk.census = chunk.examine(cached.get(&name(chunk)), needs_fov).ok();
+        let progress = Progress::of(self.chunks.len());
+        let examine = |chunk: &mut Chunk| {
+            chunk.census = chunk.examine(cached.get(&name(chunk)), needs_fov).ok();
+            progress.advance();
+        };
         self.chunks.par_iter_mut().for_each(examine);
         let chunks = self.chunks.iter().filter_map(|chunk| Some((name(chunk), chunk.census.clone()?)));
         // The other split may have its chunks in the same folder.

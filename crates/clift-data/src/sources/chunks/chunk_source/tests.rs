@@ -1,8 +1,10 @@
 use super::*;
+use crate::sources::chunks::census::observe_census;
 use crate::sources::chunks::writer::{SceneRecord, chunk_bytes, scene_file_bytes, write_chunks};
 use crate::testing::{fixture, re10k_mini};
 use crate::torch::pickle_writer::PickleWriter;
 use safetensors::SafeTensors;
+use std::sync::Mutex;
 
 const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
 
@@ -316,6 +318,21 @@ fn unchanged_chunks_are_not_read_again() {
         assert_eq!((tables, num_frames), (1, 18), "{report}");
         assert!(report.contains("bad chunk: "), "{report}");
     }
+}
+
+#[test]
+fn the_observer_hears_of_every_chunk() {
+    static HEARD: Mutex<Vec<usize>> = Mutex::new(Vec::new());
+    observe_census(|done, total| {
+        // Other tests open other numbers of chunks.
+        if total == 11 {
+            HEARD.lock().unwrap().push(done);
+        }
+    });
+    let folder = tempfile::tempdir().unwrap();
+    write_made_up(folder.path(), 11, 1, 9);
+    open_with_census(folder.path(), &SceneFilters { min_frames: 9, max_fov_deg: None });
+    assert_eq!(*HEARD.lock().unwrap(), (1..=11).collect::<Vec<_>>());
 }
 
 /// Figures of docs/results/performance.md.
