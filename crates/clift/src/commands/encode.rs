@@ -42,10 +42,11 @@ pub struct EncodeArgs {
     /// Split of the data set: train or test
     #[arg(long, value_name = "SPLIT", default_value = "test", value_parser = parse_split)]
     pub split: Split,
-    /// Context frames by position or file name [default: as many as in training]
+    /// Context frames by position or file name [default: spread along the path]
     ///
     /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
-    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. The default is spread along the camera path.
+    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. By default, as many as in training; of a capture, every fourth
+    /// frame, up to three times as many, if the network has camera-relative attention.
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
     pub context: Vec<String>,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
@@ -117,7 +118,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let reader = ClipReader { source, options: config.data.clip_options() };
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then_some(context),
-        num_context: config.data.views.max_context,
+        num_context: model_args.num_context(config.data.views.max_context, reader.source.num_frames(scene)?),
         storage: TokenCount::Share(0.25),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),

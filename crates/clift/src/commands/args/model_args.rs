@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clift_data::{DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SourceKind, SourceOptions, Split};
 use clift_data::{open_dataset, open_source};
-use clift_model::{ModelError, ModelPath, TrainedModel};
+use clift_model::{CameraEncoding, ModelError, ModelPath, TrainedModel};
 use clift_train::{Config, Override};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
@@ -71,6 +71,14 @@ impl ModelArgs {
             print_note(&format!("{}: {}", folder.display(), opened.report));
         }
         Ok(opened)
+    }
+
+    /// Returns the default number of context views: `trained`, or for photos up to three times as many, one for every
+    /// fourth frame. With camera-relative attention, views beside those of training improve the renderings
+    /// (models/rooms/README.md).
+    pub fn num_context(&self, trained: usize, num_frames: usize) -> usize {
+        let takes_more = self.folder.is_some() && self.config.model.camera_encoding != CameraEncoding::Plucker;
+        if takes_more { (num_frames / 4).clamp(trained, 3 * trained) } else { trained }
     }
 
     /// Reads the weights.
