@@ -37,6 +37,21 @@ fn captures_train_and_render_and_name_missing_frames() {
 }
 
 #[test]
+fn the_shipped_model_encodes_photos_and_is_small() {
+    let place = Place::new();
+    place.clift("data synth DIR/scene --look real --scenes 1 --frames 16 --size 64x64").ok();
+    let mut command = Command::new(BINARY);
+    command.arg("encode").arg(place.at("scene")).arg("-o").arg(place.at("scene.clift"));
+    let ran = finish(start(command.env_remove("CLIFT_MODEL").current_dir(repository("."))));
+    let ran = ran.ok().prints("4 views of 64 x 64").prints("(clift, coded").notes("model: models/rooms");
+    // Its rendering of a frame beside the contexts is better than a copy of the nearest context.
+    assert!(ran.stdout.contains("check: frame 2, ") && !ran.stderr.contains("warning"), "{}{}", ran.stdout, ran.stderr);
+    let files = std::fs::read_dir(repository("models/rooms")).unwrap();
+    let bytes: u64 = files.map(|file| file.unwrap().metadata().unwrap().len()).sum();
+    assert!(bytes <= 8_000_000, "{bytes}");
+}
+
+#[test]
 fn dl3dv_training_requires_a_test_scene_list() {
     let place = Place::new();
     for source in ["dl3dv", "auto", "captures"] {
