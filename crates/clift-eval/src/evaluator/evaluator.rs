@@ -60,7 +60,7 @@ impl Evaluator {
         eval.precision.check("eval.precision", device)?;
         let (items, skip_report, split) = evaluation_items(&eval, &reader, frames)?;
         // An early check: a run must not fail after training.
-        let tokens_per_view = sweep.model.num_tokens(1, reader.options.height, reader.options.width)?;
+        let tokens_per_view = sweep.model.num_patches(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
         check_counts(&eval, fewest_views * tokens_per_view)?;
         Ok(Self { eval, sweep, description, reader, items, split, skip_report, device: device.clone() })

@@ -103,7 +103,7 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
     let keep = |kept: f64| Segment { kept, ..Segment::default() };
     let mut segments: Vec<Segment> = of_part(Part::Encoder).collect();
     // The first reader of the tokens keeps them.
-    let mut tokens = values(&[Rows::ContextPatches]);
+    let mut tokens = scene.num_tokens as f64 * config.dim as f64;
     segments.push(keep(tokens));
     if trained.contains(&Part::Condenser) {
         // Members are gathered once for all blocks; a condenser whose keys are all tokens gathers none.
@@ -141,7 +141,7 @@ fn segment(
     for layer in layers {
         let rows = scene.num_rows(layer.rows);
         let input = match layer.kind {
-            LayerKind::Linear { inputs: width, .. } | LayerKind::LayerNorm { width } => values(rows, width),
+            LayerKind::Linear { inputs: width, .. } | LayerKind::LayerNorm { width, .. } => values(rows, width),
             LayerKind::Activation { width } => {
                 hidden = values(rows, width);
                 hidden

@@ -129,16 +129,39 @@ impl ModelConfig {
         self.patch_size * self.patch_size * 3
     }
 
-    /// Returns the number of tokens of `num_views` views of `width` by `height` pixels.
+    /// Returns the number of patches of `num_views` views of `width` by `height` pixels.
     ///
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
-    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+    pub fn num_patches(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
         let patch_size = self.patch_size;
         if height == 0 || width == 0 || !height.is_multiple_of(patch_size) || !width.is_multiple_of(patch_size) {
             return Err(ModelError::NotDivisible { width, height, patch_size });
         }
         Ok(num_views * (height / patch_size) * (width / patch_size))
+    }
+
+    /// Returns the number of encoder tokens of `num_views` context views: one per patch.
+    ///
+    /// # Errors
+    /// As [`num_patches`](Self::num_patches).
+    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+        self.num_patches(num_views, height, width)
+    }
+
+    /// Whether linear layers and layer norms have biases.
+    pub(crate) fn has_biases(&self) -> bool {
+        true
+    }
+
+    /// Whether the heads of queries and keys have norms.
+    pub(crate) fn has_query_key_norms(&self) -> bool {
+        self.variant.has_norms()
+    }
+
+    /// Whether the encoder's tokens have a norm.
+    pub(crate) fn has_token_norm(&self) -> bool {
+        self.variant.has_norms()
     }
 
     /// Checks every value against its range.
@@ -241,7 +264,7 @@ mod tests {
 
     #[test]
     fn an_image_of_partial_patches_is_an_error() {
-        let error = ModelConfig::default().num_tokens(1, 250, 256).unwrap_err();
+        let error = ModelConfig::default().num_patches(1, 250, 256).unwrap_err();
         assert_eq!(error.to_string(), "an image of 256 x 250 does not divide into patches of 8 x 8");
         assert!(ModelConfig::default().num_tokens(1, 0, 256).is_err());
         assert_eq!(ModelConfig::default().num_tokens(4, 256, 448).expect("divides"), 7168);

@@ -44,8 +44,8 @@ impl Encoder {
     /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
     pub fn forward(&self, context: &Views) -> Tokens {
         let transforms = self.transforms(&context.cameras);
-        let values = self.blocks.iter().fold(self.embed(context), |x, block| block.forward(x, transforms.as_ref()));
-        Tokens { values, transforms }
+        let x = self.blocks.iter().fold(self.embed(context), |x, block| block.forward(x, transforms.as_ref()));
+        Tokens { values: self.to_tokens(x), transforms }
     }
 
     /// Makes the transforms of the tokens for camera-relative attention; `None` without it.
@@ -53,7 +53,7 @@ impl Encoder {
         self.transforms.of_views(context)
     }
 
-    /// Embeds patches and rays: the input of the first block, in the shape of [`forward`](Self::forward)'s result.
+    /// Embeds patches and rays: the input of the first block, `[batch, rows, dim]`.
     pub fn embed(&self, context: &Views) -> Tensor<3> {
         let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
         linear_in_f32(&self.patch_embed, patchify(pixels, self.patch_size))
@@ -62,5 +62,14 @@ impl Encoder {
     /// Returns the blocks after [`embed`](Self::embed).
     pub fn blocks(&self) -> &[EncoderBlock] {
         &self.blocks
+    }
+
+    /// Returns the tokens of a scene, given the output of the last block.
+    ///
+    /// # Shapes
+    /// - `x`: `[batch, rows, dim]`, as [`embed`](Self::embed) returns
+    /// - returns `[batch, num_tokens, dim]`
+    pub fn to_tokens(&self, x: Tensor<3>) -> Tensor<3> {
+        x
     }
 }

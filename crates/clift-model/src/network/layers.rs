@@ -61,8 +61,8 @@ pub type Sequence = &'static [Rows];
 pub enum LayerKind {
     /// Matrix product.
     Linear { inputs: usize, outputs: usize, bias: bool },
-    /// Layer norm with scale and shift.
-    LayerNorm { width: usize },
+    /// Layer norm with scale and, with `bias`, shift.
+    LayerNorm { width: usize, bias: bool },
     /// RMS norm of every head of queries or keys; the heads share one scale.
     HeadNorm { width: usize, heads: usize },
     /// Softmax attention of every row to all keys of its group.
@@ -79,7 +79,8 @@ impl Layer {
         let shapes = match self.kind {
             LayerKind::Linear { inputs, outputs, bias: true } => vec![vec![outputs, inputs], vec![outputs]],
             LayerKind::Linear { inputs, outputs, bias: false } => vec![vec![outputs, inputs]],
-            LayerKind::LayerNorm { width } => vec![vec![width], vec![width]],
+            LayerKind::LayerNorm { width, bias: true } => vec![vec![width], vec![width]],
+            LayerKind::LayerNorm { width, bias: false } => vec![vec![width]],
             LayerKind::HeadNorm { width, .. } => vec![vec![width]],
             LayerKind::Attention { .. } | LayerKind::ClusterAttention { .. } | LayerKind::Activation { .. } => vec![],
         };
@@ -109,7 +110,7 @@ const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
 const TARGETS: Sequence = &[Rows::TargetPatches];
 
 fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
-    let ModelConfig { dim, variant, .. } = *config;
+    let dim = config.dim;
     let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
 
     list.enter(Part::Encoder, None, "encoder");
@@ -121,7 +122,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
         list.norm("norm_attn", CONTEXT);
         list.norm("norm_ff", CONTEXT);
     }
-    if variant.has_norms() {
+    if config.has_token_norm() {
         list.enter(Part::TokenNorm, None, "lift_norm");
         list.norm("norm", CONTEXT);
     }
@@ -136,7 +137,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.norm("output_norm", TARGETS);
     list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
 
-    if variant.is_released() {
+    if config.variant.is_released() {
         list.enter(Part::Condenser, Some(0), "condenser.released");
         list.decoder_block(STORED, CONTEXT);
         list.linear("gate", [dim, dim], STORED, true);
@@ -151,7 +152,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
             list.norm("norm_cross", GATHERING);
         }
         // All blocks share one copy of the members.
-        list.push("norm_memory", LayerKind::LayerNorm { width: dim }, MEMBERS, false);
+        list.push("norm_memory", LayerKind::LayerNorm { width: dim, bias: true }, MEMBERS, false);
         list.norm("norm_ff", STORED);
         list.cross_attention(GATHERING, !residual, MEMBERS);
         list.feed_forward(STORED);
@@ -180,11 +181,13 @@ impl LayerList<'_> {
     }
 
     fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
-        self.push(name, LayerKind::Linear { inputs, outputs, bias: true }, rows, saves_input);
+        let bias = self.config.has_biases();
+        self.push(name, LayerKind::Linear { inputs, outputs, bias }, rows, saves_input);
     }
 
     fn norm(&mut self, name: &str, rows: Sequence) {
-        self.push(name, LayerKind::LayerNorm { width: self.config.dim }, rows, true);
+        let bias = self.config.has_biases();
+        self.push(name, LayerKind::LayerNorm { width: self.config.dim, bias }, rows, true);
     }
 
     /// Adds self-attention after a norm, with one packed projection.
@@ -209,9 +212,9 @@ impl LayerList<'_> {
     }
 
     fn attention_output(&mut self, name: &str, rows: Sequence, keys: Sequence) {
-        let ModelConfig { dim, num_heads: heads, variant, .. } = *self.config;
+        let ModelConfig { dim, num_heads: heads, .. } = *self.config;
         self.linear(&format!("{name}.out_proj"), [dim, dim], rows, true);
-        if variant.has_norms() && self.part != Part::Condenser {
+        if self.config.has_query_key_norms() && self.part != Part::Condenser {
             let norm = LayerKind::HeadNorm { width: dim / heads, heads };
             self.push(&format!("{name}.qk_norm.query"), norm, rows, true);
             self.push(&format!("{name}.qk_norm.key"), norm, keys, true);

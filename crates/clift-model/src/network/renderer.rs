@@ -56,8 +56,8 @@ impl Renderer {
     pub fn forward(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         let tokens = tokens.into();
         let transforms = self.transforms(targets);
-        let forward = |x, block: &DecoderBlock| block.forward(x, tokens.project(block), transforms.as_ref());
-        self.to_image(self.blocks.iter().fold(self.embed(targets), forward), targets)
+        let block = |x, block| self.block(block, x, &tokens, transforms.as_ref());
+        self.to_image((0..self.num_blocks()).fold(self.embed(&tokens, targets), block), targets)
     }
 
     /// Makes the transforms of the patches of target views for camera-relative attention, one sequence per view; `None`
@@ -82,30 +82,50 @@ impl Renderer {
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
-        let x = self.embed(targets);
+        let x = self.embed_rays(targets);
         let transforms = self.transforms(targets);
         let blocks = self.blocks.iter().zip(&cache.blocks);
         let x = blocks.fold(x, |x, (block, key_value)| block.forward(x, key_value.clone(), transforms.as_ref()));
         self.to_image(x, targets)
     }
 
-    /// Embeds the rays of every patch: the input of the first block, `[batch * views, num_queries, dim]`.
-    pub fn embed(&self, targets: &Cameras) -> Tensor<3> {
+    /// Embeds the rays of every patch: the input of the first block, `[batch * views, rows, dim]`.
+    pub fn embed(&self, _tokens: &RenderTokens, targets: &Cameras) -> Tensor<3> {
+        self.embed_rays(targets)
+    }
+
+    /// `[batch * views, num_queries, dim]`
+    fn embed_rays(&self, targets: &Cameras) -> Tensor<3> {
         let [batch, views] = targets.dims();
         let rays = linear_in_f32(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
         let [_, queries, dim] = rays.dims();
         rays.reshape([batch * views, queries / views, dim])
     }
 
-    /// Returns the blocks between [`embed`](Self::embed) and [`to_image`](Self::to_image).
-    pub fn blocks(&self) -> &[DecoderBlock] {
-        &self.blocks
+    /// Returns the number of blocks between [`embed`](Self::embed) and [`to_image`](Self::to_image).
+    pub fn num_blocks(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// Applies a block to the patches of target views.
+    ///
+    /// # Shapes
+    /// - `x` and the result: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
+    pub fn block(
+        &self,
+        block: usize,
+        x: Tensor<3>,
+        tokens: &RenderTokens,
+        transforms: Option<&TokenTransforms>,
+    ) -> Tensor<3> {
+        let block = &self.blocks[block];
+        block.forward(x, tokens.project(block), transforms)
     }
 
     /// Decodes the output of the last block into images.
     ///
     /// # Shapes
-    /// - `x`: `[batch * views, num_queries, dim]`
+    /// - `x`: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn to_image(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
         let [batch, views] = targets.dims();

@@ -54,7 +54,7 @@ impl Scene {
                 self.width, self.height
             ));
         }
-        let num_patches = self.model.num_tokens(views, self.height, self.width).map_err(|error| error.to_string())?;
+        let num_patches = self.model.num_patches(views, self.height, self.width).map_err(|error| error.to_string())?;
         if num_patches > MAX_PATCHES {
             return Err(format!("{num_patches} patches of context views, expected at most {MAX_PATCHES}"));
         }

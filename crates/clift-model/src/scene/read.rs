@@ -88,7 +88,7 @@ fn from_bytes(
         let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
         let codec = find_codec(fields.get("model_path")?).map_err(|reason| refusal(reason, GIVE_MODEL))?;
         let (scene, step) = from_coded_bytes(bytes, body, &fields, &codec)?;
-        let num_patches = scene.model.num_tokens(scene.context.len(), scene.height, scene.width).unwrap_or(1);
+        let num_patches = scene.model.num_patches(scene.context.len(), scene.height, scene.width).unwrap_or(1);
         let loss = codec.rates.loss(scene.num_tokens() as f64 / num_patches as f64, f64::from(step));
         return Ok((scene, TokenCoding::Coded(CodedLoss::from_db(loss))));
     }

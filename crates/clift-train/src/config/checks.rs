@@ -99,7 +99,7 @@ impl Config {
 
     fn validate_token_counts(&self) -> Result<(), TrainError> {
         let views = &self.data.views;
-        let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
+        let tokens_per_view = self.model.num_patches(1, self.data.height, self.data.width)?;
         let most_tokens = views.max_context.saturating_mul(tokens_per_view);
         if most_tokens > MAX_TOKENS {
             let fix = format!("{most_tokens} tokens exceed {MAX_TOKENS}: write fewer or smaller views");

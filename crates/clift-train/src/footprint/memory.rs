@@ -103,7 +103,7 @@ fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
         num_tokens: most,
         num_clusters: cluster_counts(config, most)?.last().copied(),
         num_targets: 0,
-        num_patches: num_tokens(config, 1)?,
+        num_patches: config.model.num_patches(1, config.data.height, config.data.width)?,
         num_image_values: image_values(config),
         metric_working: 0.0,
         metric_parameters: 0.0,
@@ -125,7 +125,7 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
         num_tokens: all,
         num_clusters: stored.iter().max().copied(),
         num_targets: eval.num_targets.min(VIEWS_PER_PASS),
-        num_patches: num_tokens(config, 1)?,
+        num_patches: config.model.num_patches(1, config.data.height, config.data.width)?,
         // Images of every count and method are kept until the metrics of the scene are computed.
         num_image_values: eval.num_targets * (num_rendered + 3) * config.data.width * config.data.height * 3,
         // Features of the images, their unit vectors, and input and output of a layer; or the file of weights while it is

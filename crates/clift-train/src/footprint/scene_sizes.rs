@@ -112,7 +112,8 @@ pub fn scene_with_all_tokens(
     num_context: usize,
     num_targets: usize,
 ) -> Result<SceneSizes, TrainError> {
-    Ok(SceneSizes::new(num_tokens(config, num_context)?, num_targets, num_tokens(config, 1)?))
+    let size = [config.data.height, config.data.width];
+    Ok(SceneSizes::of(&config.model, num_context, num_targets, size)?)
 }
 
 /// Returns the sizes of a scene whose target views are rendered from `count` stored tokens.

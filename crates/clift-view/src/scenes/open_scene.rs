@@ -87,7 +87,7 @@ impl OpenScene {
             patch: scene.model.patch_size,
             stored: scene.num_tokens(),
             storage_counts: &origin.storage_counts,
-            num_patches: scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?,
+            num_patches: scene.model.num_patches(scene.context.len(), scene.height, scene.width)?,
             bytes: origin.file_bytes,
             tokens: format!("{}, {}", scene.kind, origin.coding),
             token_ids: &scene.token_ids,

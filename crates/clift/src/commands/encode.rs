@@ -210,7 +210,7 @@ impl Coding {
         let Self::Bytes(codec, bytes) = self else { return args.storage.unwrap_or(options.storage) };
         let views = options.context.as_ref().map_or(options.num_context, Vec::len);
         let (height, width) = (reader.options.height, reader.options.width);
-        let num_patches = codec.model.num_tokens(views, height, width).unwrap_or(1);
+        let num_patches = codec.model.num_patches(views, height, width).unwrap_or(1);
         let tokens = *bytes as f64 - coded_overhead(views, options.model_path.len()) as f64;
         let best = TokenCount::Share(codec.rates.share_for_bytes(num_patches, tokens.max(1.0)));
         args.storage.unwrap_or(best)
