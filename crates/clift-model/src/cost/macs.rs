@@ -88,7 +88,7 @@ impl Layer {
             LayerKind::LayerNorm { width, .. } => Macs { normalized: rows * width as u64, ..Macs::default() },
             LayerKind::Attention { width, keys, .. } => pairs(rows * sizes.group_len(keys), width),
             LayerKind::ClusterAttention { width, keys } => pairs(sizes.num_rows(keys), width),
-            LayerKind::HeadNorm { .. } | LayerKind::Activation { .. } => Macs::default(),
+            LayerKind::HeadNorm { .. } | LayerKind::Activation { .. } | LayerKind::Table { .. } => Macs::default(),
         }
     }
 }

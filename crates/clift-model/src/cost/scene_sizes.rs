@@ -74,6 +74,7 @@ impl SceneSizes {
         let stored = self.num_storage_tokens.unwrap_or(0);
         let len = |rows: &Rows| match rows {
             Rows::ContextPatches => self.num_context_patches,
+            Rows::Latents => self.num_tokens,
             Rows::Members => self.num_tokens.saturating_sub(stored),
             Rows::StoredTokens | Rows::GatheringTokens => stored,
             Rows::RenderTokens => self.num_render_tokens,

@@ -41,6 +41,8 @@ pub enum Part {
 pub enum Rows {
     /// Patches of all context views, and their tokens.
     ContextPatches,
+    /// Tokens that are encoded beside the patches.
+    Latents,
     /// Tokens that are not centroids.
     Members,
     /// Centroids.
@@ -71,6 +73,8 @@ pub enum LayerKind {
     ClusterAttention { width: usize, keys: Sequence },
     /// GELU or `ReLU` between the layers of a feed-forward network.
     Activation { width: usize },
+    /// Learned rows, beside the layer's input.
+    Table { rows: usize, width: usize },
 }
 
 impl Layer {
@@ -80,8 +84,8 @@ impl Layer {
             LayerKind::Linear { inputs, outputs, bias: true } => vec![vec![outputs, inputs], vec![outputs]],
             LayerKind::Linear { inputs, outputs, bias: false } => vec![vec![outputs, inputs]],
             LayerKind::LayerNorm { width, bias: true } => vec![vec![width], vec![width]],
-            LayerKind::LayerNorm { width, bias: false } => vec![vec![width]],
-            LayerKind::HeadNorm { width, .. } => vec![vec![width]],
+            LayerKind::LayerNorm { width, bias: false } | LayerKind::HeadNorm { width, .. } => vec![vec![width]],
+            LayerKind::Table { rows, width } => vec![vec![1, rows, width]],
             LayerKind::Attention { .. } | LayerKind::ClusterAttention { .. } | LayerKind::Activation { .. } => vec![],
         };
         let paths = ["weight", "bias"].map(|name| format!("{}.{name}", self.path));
@@ -98,7 +102,7 @@ impl ModelConfig {
     /// Lists every layer in the order of published checkpoints: encoder, token norm, renderer, condenser; within a block
     /// attention, feed-forward network, norms.
     pub(crate) fn layers(&self) -> Vec<Layer> {
-        clift_layers(self)
+        if self.has_latents() { lvsm_layers(self) } else { clift_layers(self) }
     }
 }
 
@@ -108,6 +112,33 @@ const STORED: Sequence = &[Rows::StoredTokens];
 const GATHERING: Sequence = &[Rows::GatheringTokens];
 const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
 const TARGETS: Sequence = &[Rows::TargetPatches];
+const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
+const TARGETS_AND_LATENTS: Sequence = &[Rows::TargetPatches, Rows::RenderTokens];
+
+fn lvsm_layers(config: &ModelConfig) -> Vec<Layer> {
+    let ModelConfig { dim, num_latents, .. } = *config;
+    let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
+
+    list.enter(Part::Encoder, None, "encoder");
+    list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
+    list.push("latents", LayerKind::Table { rows: num_latents, width: dim }, LATENTS_AND_CONTEXT, false);
+    for i in 0..config.num_encoder_blocks {
+        list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
+        list.encoder_block(LATENTS_AND_CONTEXT);
+    }
+
+    list.enter(Part::Renderer, None, "renderer");
+    list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
+    list.norm("joint.input_norm", if config.variant.is_released() { RENDER_TOKENS } else { TARGETS_AND_LATENTS });
+    for i in 0..config.num_renderer_blocks {
+        list.enter(Part::Renderer, Some(i), &format!("renderer.joint.blocks.{i}"));
+        list.encoder_block(TARGETS_AND_LATENTS);
+    }
+    list.enter(Part::Renderer, None, "renderer");
+    list.norm("output_norm", TARGETS);
+    list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
+    list.layers
+}
 
 fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     let dim = config.dim;
@@ -117,10 +148,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
     for i in 0..config.num_encoder_blocks {
         list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
-        list.self_attention("attn", CONTEXT);
-        list.feed_forward(CONTEXT);
-        list.norm("norm_attn", CONTEXT);
-        list.norm("norm_ff", CONTEXT);
+        list.encoder_block(CONTEXT);
     }
     if config.has_token_norm() {
         list.enter(Part::TokenNorm, None, "lift_norm");
@@ -137,7 +165,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.norm("output_norm", TARGETS);
     list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
 
-    if config.variant.is_released() {
+    if config.has_released_condenser() {
         list.enter(Part::Condenser, Some(0), "condenser.released");
         list.decoder_block(STORED, CONTEXT);
         list.linear("gate", [dim, dim], STORED, true);
@@ -227,6 +255,14 @@ impl LayerList<'_> {
         self.linear("feed_forward.up", [dim, hidden], rows, false);
         self.push("feed_forward", LayerKind::Activation { width: hidden }, rows, true);
         self.linear("feed_forward.down", [hidden, dim], rows, false);
+    }
+
+    /// Adds PyTorch's pre-norm encoder layer.
+    fn encoder_block(&mut self, rows: Sequence) {
+        self.self_attention("attn", rows);
+        self.feed_forward(rows);
+        self.norm("norm_attn", rows);
+        self.norm("norm_ff", rows);
     }
 
     /// Adds PyTorch's pre-norm decoder layer.
