@@ -106,12 +106,13 @@ class Bench:
     def command(self, side: Side, round_: int | None, variant: str | None) -> list[str]:
         if isinstance(side, Torch):
             return self.worker(self.torch_spec(side, round_, variant))
-        size = SIZES[side.size or self.args.size]
+        size = dict(SIZES[side.size or self.args.size])
         # The first step has no optimiser state yet while it goes backward: the second one's memory counts.
         repeats, warmup = (1, 1) if side.contexts else (self.args.repeats, self.args.warmup)
         command = [str(self.clift), "bench", str(self.args.config), "--case", side.work, "--device", "flex"]
         command += ["--no-error", "--repeats", str(repeats), "--warmup", str(warmup), "--storage", "1/4"]
-        for override in [*overrides(size | ({"contexts": side.contexts} if side.contexts else {})), *side.overrides]:
+        size |= {"contexts": side.contexts} if side.contexts else {}
+        for override in [*overrides(size, side.is_lvsm), *side.overrides]:
             command += ["--set", override]
         command += ["--set", f"seed={round_}", "--json", str(self.folder / "ours.json")]
         if side.work == "kmeans":

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 # `side` is that of every view in pixels, `batch` that of training steps; all other cases use one scene.
 FULL = dict(dim=768, heads=8, feed_forward=2048, encoder_blocks=6, renderer_blocks=6, condenser_blocks=2)
-FULL |= dict(contexts=4, side=256, targets=1, batch=1)
+FULL |= dict(contexts=4, side=256, targets=1, batch=1, latents=1024)
 TINY = dict(dim=128, heads=8, feed_forward=341, encoder_blocks=3, renderer_blocks=3, condenser_blocks=2)
-TINY |= dict(contexts=4, side=64, targets=1, batch=8)
+TINY |= dict(contexts=4, side=64, targets=1, batch=8, latents=64)
 SMOKE = dict(dim=64, heads=4, feed_forward=96, encoder_blocks=1, renderer_blocks=1, condenser_blocks=2)
-SMOKE |= dict(contexts=4, side=32, targets=1, batch=2)
+SMOKE |= dict(contexts=4, side=32, targets=1, batch=2, latents=16)
 SIZES = {"full": FULL, "tiny": TINY, "smoke": SMOKE}
 
 
@@ -22,6 +22,7 @@ class Ours:
     overrides: tuple[str, ...] = ()
     size: str | None = None  # None: the one asked for
     contexts: int | None = None
+    is_lvsm: bool = False  # LVSM's encoder-decoder of the same sizes, with its own blocks
 
 
 @dataclass(frozen=True)
@@ -73,23 +74,33 @@ def rows() -> list[Row]:
         same("condense", ("ratio", 0.8)),
         same("cluster_attention", ("ratio", 0.1)),
         same("kmeans", ("ratio", 0.2), ("inertia_ratio", 1.01)),
+        Row("lvsm_step", "lvsm_step", Ours("stage1_step", is_lvsm=True), Torch("lvsm_step"), (("ratio", 0.9),)),
+        Row("lvsm_render", "lvsm_render", Ours("render", is_lvsm=True), Torch("lvsm_render"), (("ratio", 0.9),)),
         Row("growth", "growth", Ours("stage1_step", contexts=16), None, (("ours_bytes", 12e9),)),
     ]
 
 
-def overrides(size: dict[str, int]) -> list[str]:
+def overrides(size: dict[str, int], is_lvsm: bool = False) -> list[str]:
     """A size as keys of clift's config."""
     contexts, side = size["contexts"], size["side"]
     # Any clip that holds the contexts will do.
     gap, frames = max(9, contexts), max(16, 2 * contexts)
+    network = ["model.condenser.residual=true", f"model.condenser.num_blocks={size['condenser_blocks']}"]
+    if is_lvsm:
+        network = ['model.architecture="lvsm-ed"', f"model.num_latents={size['latents']}"]
+        network += ["model.condenser.num_blocks=0"]
     return [
+        *network,
+        # PyTorch's side has none of what configs/tiny.toml adds to the paper.
+        "model.patch_size=8",
+        'model.camera_encoding="plucker"',
+        'stage1.optimizer.algorithm="adamw"',
+        'stage2.optimizer.algorithm="adamw"',
         f"model.dim={size['dim']}",
         f"model.num_heads={size['heads']}",
         f"model.feed_forward_dim={size['feed_forward']}",
         f"model.num_encoder_blocks={size['encoder_blocks']}",
         f"model.num_renderer_blocks={size['renderer_blocks']}",
-        f"model.condenser.num_blocks={size['condenser_blocks']}",
-        "model.condenser.residual=true",
         f"data.width={side}",
         f"data.height={side}",
         f"data.synthetic.width={side}",

@@ -29,7 +29,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     size = dict(dim=96, heads=4, feed_forward=80, encoder_blocks=1, renderer_blocks=2, condenser_blocks=2)
-    size |= dict(contexts=2, side=32, targets=1, batch=2)
+    size |= dict(contexts=2, side=32, targets=1, batch=2, latents=16)
     model = twin.Clift(cases.model_config(size), condenser=True)
     for name, parameter in model.named_parameters():
         nn.init.normal_(parameter, mean=float("norm" in name and name.endswith("weight")), std=0.12)

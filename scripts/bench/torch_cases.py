@@ -26,6 +26,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "twin"))
 import clift_torch as twin
+import lvsm_torch as lvsm
 
 NUM_VIEWS_OF_SCENE = 8
 # The C++ encoder layer and attention that torch.nn takes in inference when it may. It is not always the faster way.
@@ -216,6 +217,19 @@ def stage1_step(size: Size, variant: str) -> Work:
     return lambda: twin.stage1_step(model, optimizer, batch)[0].item()
 
 
+def make_lvsm(size: Size) -> lvsm.Lvsm:
+    c = model_config(size)
+    blocks = (c.num_encoder_blocks, c.num_renderer_blocks)
+    return lvsm.Lvsm(lvsm.LvsmConfig(c.dim, c.num_heads, c.feed_forward_dim, *blocks, size["latents"]))
+
+
+def lvsm_step(size: Size, variant: str) -> Work:
+    model = make_lvsm(size)
+    optimizer = adamw([dict(params=list(model.parameters()), lr=1e-4)])
+    batch = training_batch(size)
+    return lambda: twin.stage1_step(model, optimizer, batch)[0].item()
+
+
 def stage2_step(size: Size, variant: str) -> Work:
     """Frozen encoder, condenser at the full rate, renderer at a tenth of it, clusters given."""
     padded, path = variant.startswith("padded"), variant.rsplit(" ", 1)[-1]
@@ -276,6 +290,12 @@ def render(size: Size, variant: str) -> Work:
     count = size.get("render_tokens", num_tokens(size))
     memory, (intrinsics, c2w) = torch.randn(1, count, size["dim"]), cameras(1, 1, side)
     return inference(lambda: renderer(memory, twin.plucker(intrinsics, c2w, side, side)))
+
+
+def lvsm_render(size: Size, variant: str) -> Work:
+    model, side = make_lvsm(size).eval(), size["side"]
+    memory, (intrinsics, c2w) = torch.randn(1, size["latents"], size["dim"]), cameras(1, 1, side)
+    return inference(lambda: model.render(memory, intrinsics, c2w, side, side))
 
 
 def render_8_views(size: Size, variant: str) -> Work:
@@ -345,6 +365,8 @@ UNSHARED = [f"{way} {path}" for way in ("batch", "one by one") for path in PATHS
 MASKS = [f"{keys}, {mask} mask" for keys in ("all", "members") for mask in ("bool", "float")]
 WORKS: dict[str, tuple[Callable[[Size, str], Work], list[str]]] = {
     "stage1_step": (stage1_step, ["sdpa"]),
+    "lvsm_step": (lvsm_step, ["sdpa"]),
+    "lvsm_render": (lvsm_render, ["sdpa"]),
     "stage2_step": (stage2_step, [f"exact {path}" for path in PATHS]),
     "stage2_step_padded": (stage2_step, [f"padded {path}" for path in PATHS]),
     "encode": (encode, PATHS),

@@ -451,7 +451,7 @@ def rust_parameters(module: nn.Module, prefix: str = "") -> dict[str, tuple[nn.P
 
     def leaf(path: str, layer: nn.Module) -> None:
         found[f"{prefix}{path}.weight"] = (layer.weight, slice(None))
-        if layer.bias is not None:
+        if getattr(layer, "bias", None) is not None:
             found[f"{prefix}{path}.bias"] = (layer.bias, slice(None))
 
     def rows(path: str, weight: nn.Parameter, bias: nn.Parameter, part: slice) -> None:
@@ -466,7 +466,14 @@ def rust_parameters(module: nn.Module, prefix: str = "") -> dict[str, tuple[nn.P
         for name, child in modules.items():
             found.update(rust_parameters(child, f"{prefix}{name}."))
 
-    if isinstance(module, Clift):
+    if hasattr(module, "rust_layers"):
+        # The modules of another twin name their layers themselves.
+        for name, layer in module.rust_layers().items():
+            if isinstance(layer, nn.ModuleList):
+                children(**{name: layer})
+            else:
+                leaf(name, layer)
+    elif isinstance(module, Clift):
         parts = dict(encoder=module.encoder, condenser=module.condenser, renderer=module.renderer)
         children(**{name: part for name, part in parts.items() if part is not None})
     elif isinstance(module, nn.ModuleList):

@@ -281,6 +281,14 @@ fn prepare(base: &Path) {
     train("runs/re10k", SMALL_DATA);
     // An example replaces PATH.
     train("runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR"));
+    for count in [64, 16] {
+        let keys = format!(
+            "run_dir='runs/lvsm-{count}' model.architecture='lvsm-ed' model.num_latents={count} \
+             model.condenser={{num_blocks=0}} stage1.keep_tokens=[1.0,1.0]"
+        );
+        let sets = keys.split_whitespace().flat_map(|key| ["--set", key]);
+        clift(&["train", config.to_str().expect("text")].into_iter().chain(sets).collect::<Vec<_>>());
+    }
     for name in ["runs/a", "runs/b"] {
         copy(&base.join("runs/tiny"), name);
     }

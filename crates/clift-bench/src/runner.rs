@@ -72,7 +72,7 @@ pub enum BenchEvent<'a> {
     Finished(&'a BenchRow),
 }
 
-/// Times the cases of `options` on the device of `config`.
+/// Times the cases of `options` on the device of `config`; of LVSM those that it has.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for impossible sizes, [`TrainError::Abandoned`] between two repetitions after `stop` was set, and
@@ -84,7 +84,9 @@ pub fn run_bench(
     report: &mut dyn FnMut(BenchEvent),
 ) -> Result<BenchReport, TrainError> {
     let context = BenchContext::new(config, options)?;
-    let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(|case| options.cases.contains(case)).collect();
+    let is_measured =
+        |case: &BenchCase| options.cases.contains(case) && (case.is_of_latents() || !config.model.has_latents());
+    let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(is_measured).collect();
     let total = cases.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;
     let mut rows = Vec::with_capacity(cases.len());

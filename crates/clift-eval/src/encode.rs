@@ -67,7 +67,7 @@ impl EncodedScene {
 ///
 /// # Errors
 /// [`ModelError::BadConfig`] for frames that the scene does not have, [`ModelError::BadTokenCount`] for a count above the
-/// number of tokens, and the errors of reading the images.
+/// number of tokens, [`ModelError::BadConfig`] for fewer latents of LVSM than all, and the errors of reading the images.
 pub fn encode(
     model: &TrainedModel,
     reader: &ClipReader,
@@ -90,9 +90,20 @@ pub fn encode(
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
-    let (clusters, cluster_error) = cluster(&options.kmeans, &lift.values, options.storage, seed)?;
+    let (clusters, cluster_error) = if model.config.has_latents() {
+        if options.storage.of(num_lift_tokens)? != num_lift_tokens {
+            let fix =
+                format!("a scene of lvsm-ed is all its latents, which are not clustered: write {num_lift_tokens}");
+            return Err(bad_config("--storage", options.storage.to_string(), fix));
+        }
+        (Clusters::new(vec![SceneClusters::identity(num_lift_tokens)])?, 0.0)
+    } else {
+        cluster(&options.kmeans, &lift.values, options.storage, seed)?
+    };
     let index = clusters.upload(&model.device);
-    let (kind, tokens) = if model.has_condenser {
+    let (kind, tokens) = if model.config.has_latents() {
+        (TokenKind::Latents, lift)
+    } else if model.has_condenser {
         (TokenKind::Clift, model.network.compress(lift, &index))
     } else {
         (TokenKind::Kmeans, lift.centroids(&index))

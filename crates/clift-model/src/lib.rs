@@ -65,7 +65,7 @@ pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 pub use tokens::tiles::{Grouping, tile_clusters};
 // Networks
-pub use network::architecture::{CameraEncoding, CliftVariant};
+pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
 pub use network::camera_encoding::TokenTransforms;
 pub use network::clift::Clift;
 pub use network::condenser::Condenser;

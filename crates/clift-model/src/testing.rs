@@ -6,8 +6,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
 use crate::device::name::DeviceName;
-use crate::network::architecture::CameraEncoding;
-use crate::network::architecture::CliftVariant;
+use crate::network::architecture::{Architecture, CliftVariant};
 use crate::network::config::{CondenserConfig, ModelConfig};
 
 /// Opens every device of this build: flex, ndarray, and wgpu if an adapter exists.
@@ -30,16 +29,23 @@ pub fn small_config(variant: CliftVariant) -> ModelConfig {
         num_encoder_blocks: 1,
         num_renderer_blocks: 3,
         patch_size: 8,
-        camera_encoding: CameraEncoding::Plucker,
         condenser: CondenserConfig::of(variant),
+        ..ModelConfig::default()
     }
 }
 
-/// Returns [`small_config`] of all variants, and of the paper without residuals.
+/// Returns the small network of LVSM's paper or of `CLiFT`'s release.
+pub fn small_lvsm(variant: CliftVariant) -> ModelConfig {
+    let condenser = CondenserConfig::NONE;
+    ModelConfig { architecture: Architecture::LvsmEd, num_latents: 7, condenser, ..small_config(variant) }
+}
+
+/// Returns [`small_config`] of all variants, and of the paper without residuals, and [`small_lvsm`] of both variants.
 pub fn small_configs() -> Vec<ModelConfig> {
     let mut literal = small_config(CliftVariant::Paper);
     literal.condenser.residual = false;
-    CliftVariant::ALL.map(small_config).into_iter().chain([literal]).collect()
+    let lvsm = [CliftVariant::Paper, CliftVariant::ReleasedRe10k].map(small_lvsm);
+    CliftVariant::ALL.map(small_config).into_iter().chain([literal]).chain(lvsm).collect()
 }
 
 /// Returns the values in f64, row-major.
@@ -190,6 +196,18 @@ pub fn check_gradients<const COUNT: usize>(
             assert!((a - n).abs() <= tolerance * scale, "input {position}, entry {index}: {a} against {n}");
         }
     }
+}
+
+/// Casts the parameters of a module to f64.
+pub fn to_f64<M: burn::module::Module>(module: M) -> M {
+    use burn::module::{ModuleMapper, Param};
+    struct ToF64;
+    impl ModuleMapper for ToF64 {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            Param::from_tensor(param.val().cast(DType::F64))
+        }
+    }
+    module.map(&mut ToF64)
 }
 
 /// Loads the tensors of a fixture whose names start with `prefix` into a module, in PyTorch's layout; asserts that every

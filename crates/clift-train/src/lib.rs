@@ -71,7 +71,7 @@ pub use interchange::record::{ImportOptions, ImportRecord};
 pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
 pub use footprint::memory::{memory_warning, peak_bytes};
 pub use footprint::scene_sizes::{
-    PARTS, TypicalStep, cluster_counts, eval_sizes, measures_lpips, num_tokens, possible_sizes, scene_with_all_tokens,
+    TypicalStep, cluster_counts, eval_sizes, measures_lpips, num_tokens, possible_sizes, scene_with_all_tokens,
     scene_with_stored_tokens, typical_sizes,
 };
 // Seeded inputs for tests and benchmarks

@@ -16,7 +16,7 @@ use crate::events::{EvalEvents, Event, Sink};
 /// codec beside the weights.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for a run on tiles, whose tokens no scene file stores; those of the fit.
+/// [`TrainError::BadConfig`] for a run on tiles, whose tokens no scene file stores, and for LVSM; those of the fit.
 pub fn fit_token_codec(
     config: &Config,
     model: (&TrainedModel, &Path),
@@ -25,6 +25,10 @@ pub fn fit_token_codec(
     sink: &mut dyn Sink,
 ) -> Result<FittedCodec, TrainError> {
     let (model, weights) = model;
+    if config.model.has_latents() {
+        let fix = "the token codec is one of condensed tokens; latents are stored in f32, f16 or int8";
+        return Err(bad("model.architecture", format!("\"{}\"", config.model.architecture), fix));
+    }
     if config.clusters.grouping != Grouping::Kmeans {
         return Err(bad("clusters.grouping", "\"tile\"", "scene files have K-means tokens: choose a run on K-means"));
     }

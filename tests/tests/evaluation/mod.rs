@@ -3,6 +3,7 @@
 mod checkpoints;
 mod coded;
 pub mod eval;
+mod lvsm;
 mod report;
 mod scene_files;
 mod splits;

@@ -20,7 +20,7 @@ const SUMMARY_KEYS: &str = "\
 const POINT_KEYS: &str = "\
     frame_median_s frame_p95_s frame_quartiles_s gflops lpips_vgg lpips_vgg_per_view num_identical_views num_render_tokens \
     num_storage_tokens num_views pareto_bytes pareto_time peak_bytes psnr psnr_per_view psnr_stderr \
-    render_median_s render_p95_s render_s scene_bytes select_s ssim ssim_per_view tokens variant";
+    render_median_s render_p95_s render_s scene_bytes scene_values select_s ssim ssim_per_view tokens variant";
 
 #[test]
 fn a_run_writes_every_documented_file() {

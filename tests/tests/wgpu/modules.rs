@@ -3,9 +3,9 @@
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use clift_model::{
-    Activation, CameraEncoding, CliftVariant, DecoderBlock, Encoder, EncoderBlock, FeedForward, LiftNorm, ModelConfig,
-    RenderTokens, Renderer, SelfAttention, cross_sdpa, gelu_linear, linear, norm_linear, patchify, plucker, self_sdpa,
-    unpatchify,
+    Activation, Architecture, CameraEncoding, CliftVariant, CondenserConfig, DecoderBlock, Encoder, EncoderBlock,
+    FeedForward, Init, LiftNorm, ModelConfig, RenderTokens, Renderer, SelfAttention, cross_sdpa, gelu_linear, linear,
+    norm_linear, patchify, plucker, self_sdpa, unpatchify,
 };
 use clift_train::mse;
 
@@ -100,6 +100,15 @@ pub const CASES: &[Case] = &[
     BLOCK.because("the same with rows of keys and values").case("renderer, most tokens for each view", |place| {
         render(place, |tokens| RenderTokens::subsets(tokens, &subsets(8)))
     }),
+    BLOCK
+        .because("sums of 576 products, norms without biases and of the columns of a head, and a block")
+        .case("encoder of LVSM, latents beside patches", |place| encode(place, &lvsm(CliftVariant::Paper))),
+    BLOCK
+        .because("the same of 384 products, and a sigmoid")
+        .case("renderer of LVSM", |place| render_network(place, &lvsm(CliftVariant::Paper), RenderTokens::from)),
+    BLOCK.because("the same with biases, without norms of heads").case("renderer of LVSM in stock blocks", |place| {
+        render_network(place, &lvsm(CliftVariant::ReleasedRe10k), RenderTokens::from)
+    }),
     Tolerance::both(1e-6, 1e-6, "a sum of 4,608 squares in another order").case("mean squared error", |place| {
         let truth = Place::new(&place.device).random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 2);
         let rendering = place.random([BATCH, VIEWS * SIZE[0], SIZE[1] * 3], 1);
@@ -134,13 +143,22 @@ fn decoder_block(place: &Place, variant: CliftVariant) -> Values {
 }
 
 fn encode(place: &Place, network: &ModelConfig) -> Values {
-    let encoder = place.module(|init| Encoder::new(network, init));
+    let encoder = place.module(|_| Encoder::new(network, &mut Init::of(network, 7, &place.device)));
     let context = place.context();
     place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).values)
 }
 
 fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
-    let renderer = place.module(|init| Renderer::new(&network(CliftVariant::Paper), init));
+    render_network(place, &network(CliftVariant::Paper), choose)
+}
+
+fn lvsm(variant: CliftVariant) -> ModelConfig {
+    let (architecture, num_latents, condenser) = (Architecture::LvsmEd, 5, CondenserConfig::NONE);
+    ModelConfig { architecture, num_latents, condenser, ..network(variant) }
+}
+
+fn render_network(place: &Place, network: &ModelConfig, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
+    let renderer = place.module(|_| Renderer::new(network, &mut Init::of(network, 7, &place.device)));
     let targets = place.targets();
     place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| renderer.forward(choose(tokens), &targets))
 }

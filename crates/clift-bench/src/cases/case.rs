@@ -49,6 +49,11 @@ impl BenchCase {
         Self::ALL.iter().map(|case| case.name()).collect::<Vec<_>>().join(", ")
     }
 
+    /// Whether the case is also one of LVSM, whose tokens are neither clustered nor selected.
+    pub const fn is_of_latents(self) -> bool {
+        matches!(self, Self::Encode | Self::Render | Self::Render8Views | Self::Stage1Step)
+    }
+
     /// Whether the error is measured on a smaller problem than the time.
     pub const fn is_checked_reduced(self) -> bool {
         matches!(self, Self::Stage1Step | Self::Stage1StepTiny | Self::Stage2Step)

@@ -111,6 +111,7 @@ impl BenchContext {
     pub fn reduced(&self) -> Result<Self, TrainError> {
         let mut config = self.config.clone();
         let patch = config.model.patch_size;
+        config.model.num_latents = config.model.num_latents.min(MAX_CHECKED_TOKENS);
         let Config { data, stage1, stage2, .. } = &mut config;
         let tokens = |data: &DataConfig| data.views.min_context * (data.width / patch) * (data.height / patch);
         while tokens(data) > MAX_CHECKED_TOKENS && data.width.max(data.height) > patch {

@@ -104,7 +104,7 @@ fn shallow(config: &Config) -> Config {
     let fewest = encoder.min(renderer);
     model.num_encoder_blocks = (encoder + fewest / 2) / fewest;
     model.num_renderer_blocks = (renderer + fewest / 2) / fewest;
-    model.condenser.num_blocks = 1;
+    model.condenser.num_blocks = model.condenser.num_blocks.min(1);
     config
 }
 
@@ -228,8 +228,9 @@ pub fn inference_rates(
             kmeans.push((count, timed.seconds / seeds.len() as f64));
         }
     } else {
-        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
-        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
+        let has_latents = config.model.has_latents();
+        let last = TrainedModel::snapshot(&model, &shallow.model, !has_latents);
+        let models = EvalModels { stage2: (!has_latents).then(|| last.clone()), ..EvalModels::new(last) };
         let lpips = config.eval.lpips_path().filter(|path| measures_lpips(config) && path.is_file());
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };

@@ -28,7 +28,7 @@ pub struct Plan {
     pub num_tokens: [usize; 2],
     /// Free memory of the device; `None` if the system does not report it.
     pub available_bytes: Option<u64>,
-    /// Both stages, the cluster cache and the evaluation, in the order they run.
+    /// The stages and the evaluation, in the order they run.
     pub parts: Vec<PartPlan>,
 }
 
@@ -72,12 +72,12 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
     check_plan(config)?;
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
-    let parts = vec![
-        update(config, Stage::Stage1, &parameters, is_timed)?,
-        clusters(config, is_timed)?,
-        update(config, Stage::Stage2, &parameters, is_timed)?,
-        evaluation(config, is_timed)?,
-    ];
+    let part = |part| match part {
+        Stage::Stage1 | Stage::Stage2 => update(config, part, &parameters, is_timed),
+        Stage::Clusters => clusters(config, is_timed),
+        Stage::Eval => evaluation(config, is_timed),
+    };
+    let parts = config.parts().into_iter().map(part).collect::<Result<Vec<_>, _>>()?;
     let mut plan = Plan {
         device: config.device,
         threads: rayon::current_num_threads(),
@@ -200,7 +200,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
     let num_targets = eval.num_targets;
     let scene = scene_with_all_tokens(config, eval.num_context, num_targets)?;
-    let counts = eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
+    let counts = config.eval_storage().iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
     // Multiply-accumulates of the encoder, and of all that reads its tokens.
     let encode_and_rest = |model: &ModelConfig| {

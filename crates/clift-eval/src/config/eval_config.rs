@@ -20,7 +20,8 @@ pub struct EvalConfig {
     pub render: Vec<TokenCount>,
     /// Token selection: `paper`, `global`, `scaled` or `random`.
     pub selection: Selection,
-    /// Rendered methods of `random`, `patch`, `patch_clift`, `kmeans` and `clift`; empty for all methods with weights.
+    /// Rendered methods of `random`, `patch`, `patch_clift`, `kmeans`, `clift` and `lvsm_ed`; empty for all methods with
+    /// weights.
     pub variants: Vec<Method>,
     /// Storage of the tokens, as in a scene file: one of `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss as
     /// measured when the codec was fitted) and `coded-DB`, or a list of them to compare.

@@ -24,6 +24,8 @@ pub enum Method {
     PatchClift,
     /// A random subset of all tokens.
     Random,
+    /// All latents of LVSM's encoder-decoder, a network of its own.
+    LvsmEd,
     /// Baseline: the nearest context view.
     NearestView,
     /// Baseline: the mean of the context views.
@@ -35,8 +37,16 @@ pub enum Method {
 
 impl Method {
     /// The methods of this program.
-    pub const OWN: [Self; 7] =
-        [Self::Clift, Self::Kmeans, Self::Patch, Self::PatchClift, Self::Random, Self::NearestView, Self::MeanImage];
+    pub const OWN: [Self; 8] = [
+        Self::Clift,
+        Self::Kmeans,
+        Self::Patch,
+        Self::PatchClift,
+        Self::Random,
+        Self::LvsmEd,
+        Self::NearestView,
+        Self::MeanImage,
+    ];
 
     /// Returns the name in files and tables.
     pub fn name(self) -> &'static str {
@@ -109,7 +119,7 @@ mod tests {
             assert_eq!(serde_json::to_value(method).unwrap(), method.name());
             assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
         }
-        assert_eq!(Method::OWN.map(Method::name)[3..6], ["patch_clift", "random", "nearest_view"]);
+        assert_eq!(Method::OWN.map(Method::name)[3..7], ["patch_clift", "random", "lvsm_ed", "nearest_view"]);
         assert!(serde_json::from_value::<Method>("".into()).is_err());
     }
 }

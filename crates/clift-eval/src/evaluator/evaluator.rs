@@ -60,9 +60,9 @@ impl Evaluator {
         eval.precision.check("eval.precision", device)?;
         let (items, skip_report, split) = evaluation_items(&eval, &reader, frames)?;
         // An early check: a run must not fail after training.
-        let tokens_per_view = sweep.model.num_tokens(1, reader.options.height, reader.options.width)?;
+        let tokens_per_view = sweep.model.num_patches(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
-        check_counts(&eval, fewest_views * tokens_per_view)?;
+        check_counts(&eval, fewest_views * tokens_per_view, sweep.model.has_latents())?;
         Ok(Self { eval, sweep, description, reader, items, split, skip_report, device: device.clone() })
     }
 
@@ -222,16 +222,21 @@ impl Evaluator {
         Err(EvalError::NoPredictions { name, expected: summary.num_views, first, path })
     }
 
-    /// Returns the methods of the config, or all methods with weights.
+    /// Returns the methods of the config, or all methods with weights. Models of LVSM beside the run are always measured.
     fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
         let requested = &self.eval.variants;
         if requested.is_empty() {
             return Ok(models.methods());
         }
         let Some(method) = requested.iter().find(|method| models.for_method(**method).is_none()) else {
-            return Ok(requested.clone());
+            let beside = (!models.lvsm.is_empty() && !requested.contains(&Method::LvsmEd)).then_some(Method::LvsmEd);
+            return Ok(requested.iter().copied().chain(beside).collect());
         };
         let fix = match method {
+            _ if models.is_of_latents() => {
+                "a run with model.architecture = \"lvsm-ed\" has the method lvsm_ed alone; leave the key and --preset out"
+            }
+            Method::LvsmEd => "the run is no LVSM; add runs with model.architecture = \"lvsm-ed\" with --with",
             Method::Clift => "stage 2 was not trained on K-means clusters; remove the method",
             Method::PatchClift => {
                 "stage 2 was not trained on tiles; train a run with clusters.grouping = \"tile\" and \
@@ -268,9 +273,15 @@ pub struct SceneLimits {
     pub num_figures: usize,
 }
 
-/// Refuses storage counts above `fewest_tokens`, the smallest scene, and render counts that no scene would use.
-fn check_counts(eval: &EvalConfig, fewest_tokens: usize) -> Result<(), EvalError> {
+/// Refuses storage counts above `fewest_tokens`, the smallest scene, and render counts that no scene would use: none of LVSM,
+/// which has one count of stored tokens.
+fn check_counts(eval: &EvalConfig, fewest_tokens: usize, has_latents: bool) -> Result<(), EvalError> {
     let bad = |key, value: String, fix| Err(ModelError::BadConfig { key, value, fix }.into());
+    if has_latents {
+        let Some(count) = eval.render.first() else { return Ok(()) };
+        let fix = "the latents of lvsm-ed belong to no view, so that none can be selected by the camera: write []";
+        return bad("eval.render", count.to_string(), fix.into());
+    }
     let counts = eval.storage.iter().map(|count| ("eval.storage", count));
     for (key, count) in counts.chain([("eval.validation_storage", &eval.validation_storage)]) {
         if count.of(fewest_tokens).is_err() {

@@ -26,6 +26,19 @@ pub fn plots(summary: &Summary) -> Vec<Plot> {
             ..by_method(summary, "scene, kB", Scale::Log, kb)
         });
     }
+    // Of one network, values are tokens and work is nearly linear in them.
+    if has(|point| point.key.method == Method::LvsmEd) && has(|point| point.key.method == Method::Clift) {
+        let values = |point: &SummaryPoint| point.cost.scene_values.map(|count| count as f64);
+        let gmac = |point: &SummaryPoint| point.cost.gflops;
+        plots.push(Plot {
+            heading: "Quality against stored values",
+            ..by_method(summary, "stored values", Scale::LogValues, values)
+        });
+        plots.push(Plot {
+            heading: "Quality against the work of a view",
+            ..by_method(summary, "GMAC per view", Scale::Log, gmac)
+        });
+    }
     if has(|point| !point.key.is_whole()) {
         plots.push(by_rendered(summary));
     }
@@ -41,7 +54,8 @@ fn look(summary: &Summary, method: Method) -> Look {
         Method::Clift => Look::ALL[0],
         Method::Kmeans => Look::ALL[1],
         Method::Random => Look::ALL[2],
-        Method::Patch => Look::ALL[3],
+        // Not measured together: LVSM is compared with the paper's method, tiles with K-means.
+        Method::Patch | Method::LvsmEd => Look::ALL[3],
         // Baselines are levels, not series.
         Method::PatchClift | Method::NearestView | Method::MeanImage => Look::ALL[4],
         Method::External(_) => {

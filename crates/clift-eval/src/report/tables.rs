@@ -10,7 +10,7 @@ use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::system::machine::machine_rows;
 
-const POINTS_HEAD: [&str; 18] = [
+const POINTS_HEAD: [&str; 19] = [
     "method",
     "stored\ntokens",
     "rendered\ntokens",
@@ -25,6 +25,7 @@ const POINTS_HEAD: [&str; 18] = [
     "half of\nframes, ms",
     "p95\nms",
     "GMAC\n\u{a0}",
+    "stored\nvalues",
     "scene\nkB",
     "memory\nMB",
     "front:\ntime",
@@ -94,7 +95,7 @@ pub fn points(summary: &Summary) -> Markup {
 }
 
 /// Returns the cells of a point after the method.
-fn cells(point: &SummaryPoint) -> [String; 17] {
+fn cells(point: &SummaryPoint) -> [String; 18] {
     let tokens = |tokens: usize| if tokens == 0 { DASH.to_owned() } else { count(tokens) };
     let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
     let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
@@ -114,6 +115,7 @@ fn cells(point: &SummaryPoint) -> [String; 17] {
             .map_or_else(|| DASH.into(), |[low, high]| format!("{} .. {}", milliseconds(low), milliseconds(high))),
         ms(point.frame_p95_s),
         number(point.cost.gflops, point.cost.gflops_decimals()),
+        point.cost.scene_values.map_or_else(|| DASH.to_owned(), |values| count(values as usize)),
         number(point.cost.scene_kb(), 1),
         number(point.cost.peak_bytes.map(|bytes| bytes as f64 / 1e6), 0),
         dot(point.pareto_time),

@@ -14,8 +14,8 @@ const MAX_COLUMNS: usize = 80;
 const MAX_COUNTS: usize = 8;
 
 impl Summary {
-    /// Returns PSNR over stored tokens of the main method, of K-means and of random tokens, and of the baselines: at most
-    /// five lines of at most 80 columns, then warnings about figures that mislead. Views are rendered from all stored
+    /// Returns PSNR over stored tokens of the main method, of K-means, of random tokens and of LVSM, and of the baselines: at
+    /// most six lines of at most 80 columns, then warnings about figures that mislead. Views are rendered from all stored
     /// tokens, in the finest number format; of many counts, those evenly spread are shown.
     pub fn headline(&self) -> String {
         let best = best_method(self.points.iter().map(|point| point.key));
@@ -29,7 +29,8 @@ impl Summary {
         for count in &shown {
             let _ = write!(text, " {count:>6}");
         }
-        let others = [Method::Kmeans, Method::Random].into_iter().filter(|method| Some(*method) != best);
+        let others =
+            [Method::Kmeans, Method::Random, Method::LvsmEd].into_iter().filter(|method| Some(*method) != best);
         for method in best.into_iter().chain(others) {
             let psnr = |count: usize| {
                 let of_method = whole.clone().filter(|point| point.key.method == method);

@@ -13,13 +13,14 @@ use crate::config::method::Method;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
-/// Pairs of methods, the better method of the paper first (section 4.3).
-const ORDERINGS: [[Method; 2]; 5] = [
+/// Pairs of methods, the better method of the paper first (sections 4.2, 4.3).
+const ORDERINGS: [[Method; 2]; 6] = [
     [Method::Kmeans, Method::Random],
     [Method::Clift, Method::Kmeans],
     [Method::Kmeans, Method::Patch],
     [Method::PatchClift, Method::Patch],
     [Method::Clift, Method::PatchClift],
+    [Method::Clift, Method::LvsmEd],
 ];
 
 /// Mean PSNR difference of two methods on the same scenes, rendered from all stored tokens.

@@ -259,12 +259,15 @@ impl SummaryPoint {
 }
 
 /// Returns the times of rendering, of token selection and of both, of all views that are the same computation as those of
-/// `key`: methods and number formats with equal token counts differ in the values of their tokens only.
+/// `key`: methods and number formats with equal token counts differ in the values of their tokens only, but for those of
+/// another network.
 fn timed(results: &EvalResults, key: EvalKey) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let is_same = |other: EvalKey| {
         let has_same_selection =
             other.is_whole() && key.is_whole() || other.num_storage_tokens == key.num_storage_tokens;
-        other.num_render_tokens == key.num_render_tokens && has_same_selection && other.num_render_tokens > 0
+        let has_same_network = (other.method == Method::LvsmEd) == (key.method == Method::LvsmEd);
+        let has_same_count = other.num_render_tokens == key.num_render_tokens && other.num_render_tokens > 0;
+        has_same_network && has_same_count && has_same_selection
     };
     let views = results.views().filter(|(other, _)| is_same(*other)).flat_map(|(_, scenes)| scenes.values());
     let views: Vec<&ViewMetrics> = views.flat_map(BTreeMap::values).collect();
@@ -326,7 +329,8 @@ mod tests {
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy).unwrap();
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
-        let cost = Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
+        let cost =
+            Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
         views.note_not_measured("lpips_vgg", "no weights".into());
@@ -349,7 +353,7 @@ mod tests {
                 "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
                 "render_s": null, "render_median_s": null, "render_p95_s": null,
                 "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
-                "gflops": 2.5, "scene_bytes": 99_000, "peak_bytes": 1_048_576,
+                "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "peak_bytes": 1_048_576,
                 "pareto_time": false, "pareto_bytes": true
             }],
             "differences": []
@@ -386,6 +390,7 @@ mod tests {
         let [f16, int8] = [TokenCoding::F16, TokenCoding::INT8].map(|tokens| EvalKey { tokens: Some(tokens), ..CLIFT });
         let random = EvalKey { method: Method::Random, ..f16 };
         let all = EvalKey { num_storage_tokens: 32, ..f16 };
+        let lvsm = EvalKey { method: Method::LvsmEd, ..f16 };
         for frame in 0..8 {
             // Noise of the machine alone: the one with the lowest PSNR happens to be the fastest.
             let ms = 10.0 + frame as f64;
@@ -393,12 +398,14 @@ mod tests {
             {
                 views.add("a", frame, key, timed(ms, psnr)).unwrap();
             }
+            views.add("a", frame, lvsm, timed(40.0, 18.0)).unwrap();
         }
         let points = Summary::new(&views).points;
         let of = |key| points.iter().find(|point| point.key == key).unwrap();
         assert_eq!(of(f16).frame_median_s, of(random).frame_median_s);
         assert_eq!(of(f16).frame_quartiles_s, of(int8).frame_quartiles_s);
         assert_eq!(of(all).frame_quartiles_s, Some([0.002; 2]), "another computation: no selection");
+        assert_eq!(of(lvsm).frame_quartiles_s, Some([0.04; 2]), "another network of as many tokens");
         assert_eq!([f16, int8, random, all].map(|key| of(key).pareto_time), [true, false, false, true]);
     }
 

@@ -9,7 +9,7 @@ use crate::statistics::summary::{Quality, Summary};
 /// Largest number of missing images in the table; `summary.json` has all.
 const MAX_NAMED: usize = 3;
 
-const HEADERS: [&str; 12] = [
+const HEADERS: [&str; 13] = [
     "stored",
     "rendered",
     "format",
@@ -21,9 +21,10 @@ const HEADERS: [&str; 12] = [
     "frame ms",
     "half ms",
     "GMAC",
+    "values",
     "scene kB",
 ];
-const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 13, 7, 9];
+const WIDTHS: [usize; 13] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 13, 7, 8, 9];
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -36,7 +37,7 @@ impl fmt::Display for Summary {
         writeln!(f)?;
         let names = points.iter().map(|point| point.key.method.name().chars().count());
         let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
-        let mut row = |name: &str, cells: [String; 12], mark: &str| {
+        let mut row = |name: &str, cells: [String; 13], mark: &str| {
             write!(f, "{name:<width$}")?;
             for (cell, width) in cells.iter().zip(WIDTHS) {
                 write!(f, " {cell:>width$}")?;
@@ -69,6 +70,7 @@ impl fmt::Display for Summary {
                     .frame_quartiles_s
                     .map_or("-".into(), |[low, high]| format!("{:.1}..{:.1}", low * 1e3, high * 1e3)),
                 cell(point.cost.gflops, point.cost.gflops_decimals()),
+                point.cost.scene_values.map_or_else(|| cell(None, 0), |values| values.to_string()),
                 cell(point.cost.scene_kb(), 1),
             ];
             let mark = match (point.pareto_time, point.pareto_bytes) {
@@ -140,17 +142,18 @@ mod tests {
         views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
         views.record_missing_image(name, "b/000000.png".into());
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
-        let cost = Cost { gflops: Some(45.23), scene_bytes: Some(99_000), peak_bytes: None };
+        let cost =
+            Cost { gflops: Some(45.23), scene_values: Some(49_152), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(key, cost);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
 
-method        stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms       half ms    GMAC  scene kB
-nearest_view       -         -      -    18.00      -  0.500      -          -         -             -       -         -
-mean_image         -         -      -        -      -      -      -          -         -             -       -         -
-clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    11.2..11.8    45.2      99.0 tb
-DepthSplat         -         -      -    19.00      -      -  0.250          -         -             -       -         -
+method        stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms       half ms    GMAC   values  scene kB
+nearest_view       -         -      -    18.00      -  0.500      -          -         -             -       -        -         -
+mean_image         -         -      -        -      -      -      -          -         -             -       -        -         -
+clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    11.2..11.8    45.2    49152      99.0 tb
+DepthSplat         -         -      -    19.00      -      -  0.250          -         -             -       -        -         -
 
 frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
 t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes

@@ -39,10 +39,10 @@ impl EvalKey {
     }
 }
 
-/// Returns the main method among the keys: a condensed method, else K-means, else random tokens.
+/// Returns the main method among the keys: a condensed method, else K-means, else random tokens, else LVSM.
 pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
     let found: BTreeSet<Method> = keys.into_iter().map(|key| key.method).collect();
-    [Method::Clift, Method::PatchClift, Method::Kmeans, Method::Random]
+    [Method::Clift, Method::PatchClift, Method::Kmeans, Method::Random, Method::LvsmEd]
         .into_iter()
         .find(|method| found.contains(method))
 }
@@ -95,6 +95,9 @@ impl ViewMetrics {
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
+    /// Values of the stored tokens: tokens times their width.
+    #[serde(default)]
+    pub scene_values: Option<u64>,
     /// Mean bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
     /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.

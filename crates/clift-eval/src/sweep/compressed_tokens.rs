@@ -18,7 +18,7 @@ use crate::upload::view_cameras;
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
     pub tokens: Tokens,
-    /// The patch of the context views of every token, `[S]`.
+    /// The patch of the context views of every token, `[S]`; none of latents.
     pub ids: Vec<u32>,
     pub model: &'a TrainedModel,
     /// Size of the scene file; `None` for random subsets, which have no file.
@@ -50,7 +50,7 @@ impl<'a> CompressedTokens<'a> {
         let (num_tokens, num_views) = (ids.len(), clip.context.num_views());
         let (tokens, bytes) = match storage {
             TokenCoding::Plain(format) => {
-                let bytes = scene_file_bytes(num_tokens, model.config.dim, num_views, format);
+                let bytes = scene_file_bytes(&model.config, num_tokens, num_views, format);
                 (rounded(tokens, format)?, bytes)
             }
             TokenCoding::Coded(loss) => {
@@ -63,6 +63,17 @@ impl<'a> CompressedTokens<'a> {
             }
         };
         Ok(Self { tokens, ids, model, file_bytes: Some(bytes) })
+    }
+
+    /// Returns the latents of a model of LVSM, rounded like the tokens of a scene file.
+    pub fn latents(
+        model: &'a TrainedModel,
+        latents: Tokens,
+        format: TokenFormat,
+        num_views: usize,
+    ) -> Result<Self, EvalError> {
+        let bytes = scene_file_bytes(&model.config, latents.dims()[1], num_views, format);
+        Ok(Self { tokens: rounded(latents, format)?, ids: Vec::new(), model, file_bytes: Some(bytes) })
     }
 }
 

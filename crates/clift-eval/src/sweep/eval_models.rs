@@ -6,10 +6,10 @@ use clift_model::{Grouping, TokenCodec, TrainedModel};
 
 use crate::config::method::Method;
 
-/// The models of both stages. They have one encoder.
+/// The models of both stages, which have one encoder, and models of LVSM.
 #[derive(Clone, Debug)]
 pub struct EvalModels {
-    /// Renders random subsets and cluster centroids.
+    /// Renders random subsets and cluster centroids, or is a model of LVSM.
     pub stage1: TrainedModel,
     /// Condenses and renders K-means clusters.
     pub stage2: Option<TrainedModel>,
@@ -17,12 +17,15 @@ pub struct EvalModels {
     pub stage2_tiles: Option<TrainedModel>,
     /// Codec of the tokens of `stage2`.
     pub codec: Option<Arc<TokenCodec>>,
+    /// Models of LVSM of distinct numbers of latents: `stage1`, if it is one, or networks beside it.
+    pub lvsm: Vec<TrainedModel>,
 }
 
 impl EvalModels {
     /// Starts with the model of stage 1.
     pub fn new(stage1: TrainedModel) -> Self {
-        Self { stage1, stage2: None, stage2_tiles: None, codec: None }
+        let lvsm = stage1.config.has_latents().then(|| stage1.clone()).into_iter().collect();
+        Self { stage1, stage2: None, stage2_tiles: None, codec: None, lvsm }
     }
 
     /// Sets a model of stage 2, trained on such groups of tokens and on the encoder of stage 1.
@@ -34,10 +37,16 @@ impl EvalModels {
         }
     }
 
-    /// Returns the model that renders a method; `None` without one and for baselines.
+    /// Whether there are only models of LVSM.
+    pub fn is_of_latents(&self) -> bool {
+        self.stage1.config.has_latents()
+    }
+
+    /// Returns the model that renders a method, one of several of LVSM; `None` without one and for baselines.
     pub fn for_method(&self, method: Method) -> Option<&TrainedModel> {
         match method {
-            Method::Random | Method::Patch | Method::Kmeans => Some(&self.stage1),
+            Method::Random | Method::Patch | Method::Kmeans => Some(&self.stage1).filter(|_| !self.is_of_latents()),
+            Method::LvsmEd => self.lvsm.first(),
             Method::Clift => self.stage2.as_ref(),
             Method::PatchClift => self.stage2_tiles.as_ref(),
             Method::NearestView | Method::MeanImage | Method::External(_) => None,
@@ -46,7 +55,7 @@ impl EvalModels {
 
     /// Returns the default methods: every method with a model. Uncondensed tiles need condensed tiles beside them.
     pub fn methods(&self) -> Vec<Method> {
-        let all = [Method::Random, Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift];
+        let all = [Method::Random, Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift, Method::LvsmEd];
         let is_wanted = |method: &Method| *method != Method::Patch || self.stage2_tiles.is_some();
         all.into_iter().filter(|method| self.for_method(*method).is_some()).filter(is_wanted).collect()
     }

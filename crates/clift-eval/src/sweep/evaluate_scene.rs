@@ -5,7 +5,7 @@ use std::collections::btree_map::Entry;
 use std::time::Instant;
 
 use clift_data::{Clip, derive_seed, median};
-use clift_model::{Cameras, FlopConvention, SceneModel, Tokens, TrainedModel};
+use clift_model::{Cameras, FlopConvention, SceneModel, TokenCoding, Tokens, TrainedModel, Views};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
@@ -39,8 +39,52 @@ pub fn evaluate_scene(
     keep_images: bool,
     metrics: &mut EvalResults,
 ) -> Result<Option<SceneResults>, EvalError> {
-    let (stage1, device) = (&models.stage1.network, &models.stage1.device);
-    let features = stage1.features(&upload_views(&[&clip.context], device)?);
+    let device = &models.stage1.device;
+    let context = upload_views(&[&clip.context], device)?;
+    let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
+    let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
+    let renderer = TargetRenderer { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
+    let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
+    for rendering in &results.renderings {
+        record(clip, rendering, metrics)?;
+    }
+    let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
+    metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
+    let mut jobs = Vec::new();
+    if !models.is_of_latents() {
+        add_jobs(models, &context, &renderer, &kept_views, &mut jobs, (&mut results, metrics))?;
+    }
+    if sweep.methods.contains(&Method::LvsmEd) {
+        add_lvsm_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
+    }
+    let num_timed =
+        jobs.first().and_then(|job| metrics.of(job.key)).map_or(0, |scenes| scenes.values().map(BTreeMap::len).sum());
+    for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
+        record(clip, &rendering, metrics)?;
+        if !job.kept_views.is_empty() {
+            results.renderings.push(rendering);
+        }
+    }
+    for external in &sweep.external_methods {
+        let scored = external.score(clip, &scorer, &kept_views, metrics)?;
+        record(clip, &scored, metrics)?;
+        results.renderings.push(scored);
+    }
+    Ok((!kept_views.is_empty()).then_some(results))
+}
+
+/// Adds the renderings of `CLiFT`'s methods from every count of stored tokens.
+fn add_jobs<'a>(
+    models: &'a EvalModels,
+    context: &Views,
+    renderer: &TargetRenderer,
+    kept_views: &'a [usize],
+    jobs: &mut Vec<RenderJob<'a>>,
+    (results, metrics): (&mut SceneResults, &mut EvalResults),
+) -> Result<(), EvalError> {
+    let TargetRenderer { clip, sweep, .. } = *renderer;
+    let stage1 = &models.stage1.network;
+    let features = stage1.features(context);
     // A stage 2 with its own token norm clusters and condenses the tokens of its own norm.
     let normed: Vec<(Method, Tokens)> = [Method::Clift, Method::PatchClift]
         .into_iter()
@@ -53,17 +97,6 @@ pub fn evaluate_scene(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
-    let keep_images = !kept_views.is_empty();
-    let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
-    let renderer = TargetRenderer { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
-    let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
-    for rendering in &results.renderings {
-        record(clip, rendering, metrics)?;
-    }
-    let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
-    metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
-    let mut jobs = Vec::new();
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
         let index = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
@@ -73,11 +106,11 @@ pub fn evaluate_scene(
                 (*of, lift, LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed))
             })
             .collect();
-        for &method in &sweep.methods {
+        for &method in sweep.methods.iter().filter(|method| **method != Method::LvsmEd) {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
             let (lift, index) = own.map_or((&lift, &index), |(_, lift, index)| (*lift, index));
             for (i, tokens) in sweep.formats(method).into_iter().enumerate() {
-                let kept_views = if i == 0 { &kept_views[..] } else { &[] };
+                let kept_views = if i == 0 { kept_views } else { &[] };
                 let stored = CompressedTokens::new(method, models, (lift, index), tokens, (clip, &sweep.model_path))?;
                 let whole =
                     EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(tokens) };
@@ -106,26 +139,42 @@ pub fn evaluate_scene(
                 }
             }
         }
-        if keep_images {
+        if !kept_views.is_empty() {
             let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
             let index = own.map_or(&index, |(.., index)| index);
             results.clusters.push(index.clusters()?.scenes()[0].clone());
         }
     }
-    let num_timed =
-        jobs.first().and_then(|job| metrics.of(job.key)).map_or(0, |scenes| scenes.values().map(BTreeMap::len).sum());
-    for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
-        record(clip, &rendering, metrics)?;
-        if !job.kept_views.is_empty() {
-            results.renderings.push(rendering);
+    Ok(())
+}
+
+/// Adds the renderings of every model of LVSM, each from all its latents.
+fn add_lvsm_jobs<'a>(
+    models: &'a EvalModels,
+    context: &Views,
+    renderer: &TargetRenderer,
+    kept_views: &'a [usize],
+    jobs: &mut Vec<RenderJob<'a>>,
+    metrics: &mut EvalResults,
+) -> Result<(), EvalError> {
+    let TargetRenderer { clip, sweep, .. } = *renderer;
+    for model in &models.lvsm {
+        let latents = model.network.encode(context);
+        for (i, storage) in sweep.formats(Method::LvsmEd).into_iter().enumerate() {
+            let TokenCoding::Plain(format) = storage else { continue };
+            let stored = CompressedTokens::latents(model, latents.clone(), format, clip.context.num_views())?;
+            let count = latents.dims()[1];
+            let (num_storage_tokens, num_render_tokens) = (count, count);
+            let key = EvalKey { method: Method::LvsmEd, num_storage_tokens, num_render_tokens, tokens: Some(storage) };
+            let job = RenderJob::new(key, &stored, None, if i == 0 { kept_views } else { &[] });
+            renderer.warm_up(&job, metrics)?;
+            jobs.push(job);
+            if let Some(bytes) = stored.file_bytes {
+                metrics.add_scene_bytes(key, bytes);
+            }
         }
     }
-    for external in &sweep.external_methods {
-        let scored = external.score(clip, &scorer, &kept_views, metrics)?;
-        record(clip, &scored, metrics)?;
-        results.renderings.push(scored);
-    }
-    Ok(keep_images.then_some(results))
+    Ok(())
 }
 
 /// Adds the metrics of a scene under one key. A frame that is a target twice counts once.
@@ -189,9 +238,10 @@ impl TargetRenderer<'_> {
         self.render_view(job, 0)?;
         let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
         let target = &self.clip.target;
-        let macs = self.sweep.model.render_macs(target.height, target.width, job.key.num_render_tokens)?;
+        let macs = job.model.config.render_macs(target.height, target.width, job.key.num_render_tokens)?;
         let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
-        cost.insert(Cost { gflops, peak_bytes, scene_bytes: None });
+        let scene_values = Some((job.key.num_storage_tokens * job.model.config.dim) as u64);
+        cost.insert(Cost { gflops, scene_values, peak_bytes, scene_bytes: None });
         Ok(())
     }
 

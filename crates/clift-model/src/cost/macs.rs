@@ -85,10 +85,10 @@ impl Layer {
             LayerKind::Linear { inputs, outputs, .. } => {
                 Macs { linear: rows * (inputs * outputs) as u64, ..Macs::default() }
             }
-            LayerKind::LayerNorm { width } => Macs { normalized: rows * width as u64, ..Macs::default() },
+            LayerKind::LayerNorm { width, .. } => Macs { normalized: rows * width as u64, ..Macs::default() },
             LayerKind::Attention { width, keys, .. } => pairs(rows * sizes.group_len(keys), width),
             LayerKind::ClusterAttention { width, keys } => pairs(sizes.num_rows(keys), width),
-            LayerKind::HeadNorm { .. } | LayerKind::Activation { .. } => Macs::default(),
+            LayerKind::HeadNorm { .. } | LayerKind::Activation { .. } | LayerKind::Table { .. } => Macs::default(),
         }
     }
 }
@@ -110,7 +110,7 @@ impl ModelConfig {
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn render_macs(&self, height: usize, width: usize, num_render_tokens: usize) -> Result<Macs, ModelError> {
-        let num_patches = self.num_tokens(1, height, width)?;
+        let num_patches = self.num_patches(1, height, width)?;
         let mut macs = self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
         // The paper counts one norm more than the network has.
         macs.normalized += (num_patches * self.dim) as u64;
@@ -122,7 +122,7 @@ impl ModelConfig {
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn encode_macs(&self, num_views: usize, height: usize, width: usize) -> Result<Macs, ModelError> {
-        Ok(self.macs(Part::Encoder, &SceneSizes::new(self.num_tokens(num_views, height, width)?, 0, 0)))
+        Ok(self.macs(Part::Encoder, &SceneSizes::of(self, num_views, 0, [height, width])?))
     }
 
     /// Returns the cost of condensing `num_tokens` tokens into `num_storage_tokens`.
@@ -191,7 +191,7 @@ mod tests {
                     assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "cached, {count} tokens");
 
                     model.renderer.forward(tokens, &cameras(3));
-                    let sizes = SceneSizes::new(count, 3, config.num_tokens(1, height, width).unwrap());
+                    let sizes = SceneSizes::new(count, 3, config.num_patches(1, height, width).unwrap());
                     let expected = config.macs(Part::Renderer, &sizes);
                     assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "three views");
                 }

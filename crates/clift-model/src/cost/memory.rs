@@ -103,7 +103,7 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
     let keep = |kept: f64| Segment { kept, ..Segment::default() };
     let mut segments: Vec<Segment> = of_part(Part::Encoder).collect();
     // The first reader of the tokens keeps them.
-    let mut tokens = values(&[Rows::ContextPatches]);
+    let mut tokens = scene.num_tokens as f64 * config.dim as f64;
     segments.push(keep(tokens));
     if trained.contains(&Part::Condenser) {
         // Members are gathered once for all blocks; a condenser whose keys are all tokens gathers none.
@@ -141,11 +141,12 @@ fn segment(
     for layer in layers {
         let rows = scene.num_rows(layer.rows);
         let input = match layer.kind {
-            LayerKind::Linear { inputs: width, .. } | LayerKind::LayerNorm { width } => values(rows, width),
+            LayerKind::Linear { inputs: width, .. } | LayerKind::LayerNorm { width, .. } => values(rows, width),
             LayerKind::Activation { width } => {
                 hidden = values(rows, width);
                 hidden
             }
+            LayerKind::Table { .. } => 0.0,
             LayerKind::HeadNorm { width, heads } => {
                 // Measured: the values before and after, and half of them again.
                 head_norms += 2.5 * values(rows, width * heads);
@@ -228,7 +229,7 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     let kmeans = sizes.num_clusters.map_or(0.0, distances);
     let render = match sizes.num_targets {
         0 => 0.0,
-        num_targets => render_values(config, x, values(num_targets * sizes.num_patches)),
+        num_targets => render_values(config, x, num_targets, values(num_targets * sizes.num_patches)),
     };
     let working = sizes.num_image_values as f64 + encode.max(kmeans).max(render).max(sizes.metric_working);
     // While a file is loaded, its bytes and its tensors are in memory.
@@ -236,17 +237,22 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     F32 * (sizes.num_parameters as f64 + sizes.metric_parameters + working)
 }
 
-/// Returns the peak bytes of tensors, without weights, while views of `num_patches` patches in total are rendered from
-/// `num_render_tokens` tokens.
-pub fn render_bytes(config: &ModelConfig, num_render_tokens: usize, num_patches: usize) -> u64 {
+/// Returns the peak bytes of tensors, without weights, while `num_views` views of `num_patches` patches in total are rendered
+/// from `num_render_tokens` tokens.
+pub fn render_bytes(config: &ModelConfig, num_render_tokens: usize, num_views: usize, num_patches: usize) -> u64 {
     let values = |rows: usize| (rows * config.dim) as f64;
     let image = (num_patches * config.rgb_patch_len()) as f64;
     // Rays of the pixels (twice the image), patches, image, and its copy on the host.
-    (F32 * (render_values(config, values(num_render_tokens), values(num_patches)) + 5.0 * image)) as u64
+    (F32 * (render_values(config, values(num_render_tokens), num_views, values(num_patches)) + 5.0 * image)) as u64
 }
 
-/// Values of one block: keys and values of tokens of `x` values, and the forward of views of `y` values.
-fn render_values(config: &ModelConfig, x: f64, y: f64) -> f64 {
+/// Values of one block: keys and values of tokens of `x` values, and the forward of views of `y` values, or of views with all
+/// latents.
+fn render_values(config: &ModelConfig, x: f64, num_views: usize, y: f64) -> f64 {
+    if config.has_latents() {
+        let y = y + (num_views * config.num_latents * config.dim) as f64;
+        return x + y + forward_values(config, y);
+    }
     3.0 * x + y + forward_values(config, y)
 }
 

@@ -1,10 +1,14 @@
 //! Numbers of tokens, patches and views of a scene, and the rows of a layer's input.
 
+use crate::error::ModelError;
+use crate::network::config::ModelConfig;
 use crate::network::layers::Rows;
 
 /// Sizes of one scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SceneSizes {
+    /// Patches of all context views.
+    pub num_context_patches: usize,
     /// Encoder tokens.
     pub num_tokens: usize,
     /// Storage tokens; `None` without a condenser.
@@ -20,9 +24,10 @@ pub struct SceneSizes {
 }
 
 impl SceneSizes {
-    /// Returns the sizes of a scene whose target views are rendered from all its tokens.
+    /// Returns the sizes of a scene of one token per context patch, whose target views are rendered from all its tokens.
     pub fn new(num_tokens: usize, num_targets: usize, num_patches: usize) -> Self {
         Self {
+            num_context_patches: num_tokens,
             num_tokens,
             num_storage_tokens: None,
             num_render_tokens: num_tokens,
@@ -30,6 +35,23 @@ impl SceneSizes {
             num_targets,
             num_patches,
         }
+    }
+
+    /// Returns the sizes of a scene of a network, with views of `height` by `width` pixels, whose target views are rendered
+    /// from all its tokens.
+    ///
+    /// # Errors
+    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
+    pub fn of(
+        config: &ModelConfig,
+        num_context: usize,
+        num_targets: usize,
+        [height, width]: [usize; 2],
+    ) -> Result<Self, ModelError> {
+        let num_tokens = config.num_tokens(num_context, height, width)?;
+        let num_context_patches = config.num_patches(num_context, height, width)?;
+        let num_patches = config.num_patches(1, height, width)?;
+        Ok(Self { num_context_patches, ..Self::new(num_tokens, num_targets, num_patches) })
     }
 
     /// Tokens projected to keys and values: those of the scene, or the subsets of its views, whichever are fewer.
@@ -51,7 +73,8 @@ impl SceneSizes {
     pub(crate) fn group_len(&self, rows: &[Rows]) -> u64 {
         let stored = self.num_storage_tokens.unwrap_or(0);
         let len = |rows: &Rows| match rows {
-            Rows::ContextPatches => self.num_tokens,
+            Rows::ContextPatches => self.num_context_patches,
+            Rows::Latents => self.num_tokens,
             Rows::Members => self.num_tokens.saturating_sub(stored),
             Rows::StoredTokens | Rows::GatheringTokens => stored,
             Rows::RenderTokens => self.num_render_tokens,

@@ -1,20 +1,43 @@
-//! The variants of the network and of its attention, by name.
+//! The architectures, and the variants of the network and of its attention, by name.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::names::{names, parse};
 
-/// Variant of the network: the paper's, or one of the released code's.
+/// Kind of the network.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum Architecture {
+    /// Light-field tokens of patches, condensed by clusters, read by cross-attention.
+    #[default]
+    Clift,
+    /// The encoder-decoder of LVSM (arXiv 2410.17242): learned latents, encoded beside the patches by self-attention, and
+    /// decoded beside the target patches by self-attention.
+    LvsmEd,
+}
+
+impl Architecture {
+    /// Whether the network is `CLiFT`'s: files of such networks do not name the architecture.
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
+    pub(crate) fn is_clift(&self) -> bool {
+        *self == Self::Clift
+    }
+}
+
+/// Variant of the network: that of its paper, or one of the released code's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum CliftVariant {
-    /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
+    /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3). Of LVSM, the blocks of its own
+    /// paper: no biases, RMS norms of queries and keys.
     #[default]
     Paper,
     /// The released code's network for `RealEstate10K`. Its condenser is one pre-norm decoder layer with `ReLU`, whose keys
-    /// and values are all tokens of the cluster without a norm, followed by a gate with bias.
+    /// and values are all tokens of the cluster without a norm, followed by a gate with bias. Of LVSM, the narrower network
+    /// in `CLiFT`'s release: stock pre-norm blocks.
     ReleasedRe10k,
     /// The released code's network for DL3DV: [`CliftVariant::ReleasedRe10k`] with an RMS norm of every head's queries and
     /// keys in encoder and renderer, and a layer norm after the encoder.

@@ -32,7 +32,7 @@ pub struct Clift {
 impl Clift {
     /// Makes a model with random weights, which depend on the seed and not on the device.
     pub fn new(config: &ModelConfig, seed: u64, device: &Device) -> Self {
-        let mut init = Init::new(seed, device);
+        let mut init = Init::of(config, seed, device);
         let encoder = Encoder::new(config, &mut init);
         let renderer = Renderer::new(config, &mut init);
         // The condenser comes after encoder and renderer, whose weights so do not depend on its settings.
@@ -80,29 +80,36 @@ impl SceneModel for Clift {
     }
 
     fn supports_selection(&self) -> bool {
-        true
+        !self.renderer.is_joint()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
+    use crate::network::architecture::CliftVariant;
+    use crate::testing::{Fixture, assert_close, devices, load_weights, small_lvsm, weight_gradients};
 
     #[test]
     fn encoder_and_renderer_equal_pytorch_with_gradients() {
-        let fixture = Fixture::open("model");
-        let config = ModelConfig {
+        let small = |config| ModelConfig {
             dim: 16,
             num_heads: 4,
             feed_forward_dim: 24,
             num_encoder_blocks: 2,
             num_renderer_blocks: 2,
-            ..ModelConfig::default()
+            ..config
         };
+        assert_equals_pytorch("model", &small(ModelConfig::default()));
+        assert_equals_pytorch("lvsm", &small(small_lvsm(CliftVariant::Paper)));
+        assert_equals_pytorch("lvsm_stock", &small(small_lvsm(CliftVariant::ReleasedRe10k)));
+    }
+
+    fn assert_equals_pytorch(name: &str, config: &ModelConfig) {
+        let fixture = Fixture::open(name);
         for device in devices() {
             let device = device.autodiff();
-            let Clift { encoder, renderer, .. } = Clift::new(&config, 0, &device);
+            let Clift { encoder, renderer, .. } = Clift::new(config, 0, &device);
             let encoder = load_weights(encoder, &fixture, "weight.encoder.");
             let renderer = load_weights(renderer, &fixture, "weight.renderer.");
             let cameras = |kind: &str| Cameras {

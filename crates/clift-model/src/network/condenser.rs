@@ -19,7 +19,7 @@ use crate::tokens::clusters::ClusterIndex;
 /// Condenser blocks. Their gates start at zero: an untrained condenser returns the centroids unchanged.
 #[derive(Module, Debug)]
 pub struct Condenser {
-    /// The paper's blocks; empty in the released networks.
+    /// The paper's blocks; empty in the released networks, and in those without a condenser.
     blocks: Vec<CondenserBlock>,
     /// The single block of the released networks.
     released: Option<ReleasedCondenser>,
@@ -44,7 +44,7 @@ struct CondenserBlock {
 impl Condenser {
     /// Makes a condenser of the sizes of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
-        if config.variant.is_released() {
+        if config.has_released_condenser() {
             return Self { blocks: Vec::new(), released: Some(ReleasedCondenser::new(config, init)) };
         }
         let blocks = (0..config.condenser.num_blocks).map(|_| CondenserBlock::new(config, init)).collect();
@@ -142,7 +142,7 @@ mod tests {
     use crate::network::architecture::CliftVariant;
     use crate::network::config::CondenserConfig;
     use crate::testing::{
-        Fixture, assert_close, check_gradients, cpu_devices, devices, load_weights, random, weight_gradients,
+        Fixture, assert_close, check_gradients, cpu_devices, devices, load_weights, random, to_f64, weight_gradients,
     };
     use crate::tokens::clusters::{Clusters, SceneClusters};
 
@@ -212,18 +212,6 @@ mod tests {
         }
     }
 
-    /// Casts parameters to f64.
-    struct ToF64;
-
-    impl burn::module::ModuleMapper for ToF64 {
-        fn map_float<const D: usize>(
-            &mut self,
-            param: burn::module::Param<Tensor<D>>,
-        ) -> burn::module::Param<Tensor<D>> {
-            burn::module::Param::from_tensor(param.val().cast(DType::F64))
-        }
-    }
-
     #[test]
     fn released_gradients_equal_central_differences_in_f64() {
         for variant in [CliftVariant::ReleasedRe10k, CliftVariant::ReleasedDl3dv] {
@@ -231,7 +219,7 @@ mod tests {
                 let mut init = Init::new(5, &device);
                 let mut condenser = Condenser::new(&config(variant), &mut init);
                 condenser.released.as_mut().expect("a released network").gate = init.linear(16, 16);
-                let condenser = Module::map(condenser, &mut ToF64);
+                let condenser = to_f64(condenser);
                 // Cluster 2 has one token, which attends to itself.
                 let scene = SceneClusters::new(vec![0, 1, 1, 2, 1], vec![0, 4, 3]).expect("valid");
                 let clusters = Clusters::new(vec![scene]).expect("one");

@@ -3,15 +3,21 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
-use crate::network::architecture::CameraEncoding;
-use crate::network::architecture::CliftVariant;
+use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant};
 
-/// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
+/// Sizes of the encoder, the condenser and the renderer. The defaults are those of the network's paper, with six blocks each
+/// in encoder and renderer.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "ModelSection")]
 pub struct ModelConfig {
+    /// Kind of the network.
+    #[serde(skip_serializing_if = "Architecture::is_clift")]
+    pub architecture: Architecture,
     /// Variant of the network.
     pub variant: CliftVariant,
+    /// Latents of LVSM, the tokens of a scene; 0 in `CLiFT`, which has a token per patch.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub num_latents: usize,
     /// Width of a token.
     pub dim: usize,
     /// Attention heads in every block; divides `dim`.
@@ -34,7 +40,7 @@ pub struct ModelConfig {
 /// Sizes of the neural condenser (paper section 3.2, equations 1 to 4).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct CondenserConfig {
-    /// Condenser blocks: two in the paper, one in the released networks.
+    /// Condenser blocks: two in the paper, one in the released networks, none in LVSM.
     pub num_blocks: usize,
     /// Whether each step of a block adds its input to its output ("Add & `LayerNorm`" of the paper's text), or returns the
     /// output alone, as equations 1 to 3 print it.
@@ -47,21 +53,31 @@ impl Default for ModelConfig {
     }
 }
 
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
+fn is_zero(count: &usize) -> bool {
+    *count == 0
+}
+
 impl CondenserConfig {
+    /// No condenser.
+    pub const NONE: Self = Self { num_blocks: 0, residual: true };
+
     /// Returns the condenser of a variant.
     pub fn of(variant: CliftVariant) -> Self {
         Self { num_blocks: if variant.is_released() { 1 } else { 2 }, residual: true }
     }
 }
 
-/// [`ModelConfig`] in a file. Defaults of the condenser depend on the variant.
+/// [`ModelConfig`] in a file. Defaults of sizes depend on architecture and variant.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct ModelSection {
+    architecture: Architecture,
     variant: CliftVariant,
-    dim: usize,
-    num_heads: usize,
-    feed_forward_dim: usize,
+    num_latents: Option<usize>,
+    dim: Option<usize>,
+    num_heads: Option<usize>,
+    feed_forward_dim: Option<usize>,
     num_encoder_blocks: usize,
     num_renderer_blocks: usize,
     patch_size: usize,
@@ -80,10 +96,12 @@ struct CondenserSection {
 impl Default for ModelSection {
     fn default() -> Self {
         Self {
+            architecture: Architecture::Clift,
             variant: CliftVariant::Paper,
-            dim: 768,
-            num_heads: 8,
-            feed_forward_dim: 2048,
+            num_latents: None,
+            dim: None,
+            num_heads: None,
+            feed_forward_dim: None,
             num_encoder_blocks: 6,
             num_renderer_blocks: 6,
             patch_size: 8,
@@ -95,12 +113,20 @@ impl Default for ModelSection {
 
 impl From<ModelSection> for ModelConfig {
     fn from(section: ModelSection) -> Self {
-        let defaults = CondenserConfig::of(section.variant);
+        let ModelSection { architecture, variant, .. } = section;
+        let condenser = CondenserConfig::of(variant);
+        let (defaults, num_latents, [dim, num_heads, feed_forward_dim]) = match (architecture, variant) {
+            (Architecture::Clift, _) => (condenser, 0, [768, 8, 2048]),
+            (Architecture::LvsmEd, CliftVariant::Paper) => (CondenserConfig::NONE, LATENTS, [768, 12, 3072]),
+            (Architecture::LvsmEd, _) => (CondenserConfig::NONE, LATENTS, [512, 8, 2048]),
+        };
         Self {
-            variant: section.variant,
-            dim: section.dim,
-            num_heads: section.num_heads,
-            feed_forward_dim: section.feed_forward_dim,
+            architecture,
+            variant,
+            num_latents: section.num_latents.unwrap_or(num_latents),
+            dim: section.dim.unwrap_or(dim),
+            num_heads: section.num_heads.unwrap_or(num_heads),
+            feed_forward_dim: section.feed_forward_dim.unwrap_or(feed_forward_dim),
             num_encoder_blocks: section.num_encoder_blocks,
             num_renderer_blocks: section.num_renderer_blocks,
             patch_size: section.patch_size,
@@ -129,16 +155,56 @@ impl ModelConfig {
         self.patch_size * self.patch_size * 3
     }
 
-    /// Returns the number of tokens of `num_views` views of `width` by `height` pixels.
+    /// Returns the number of patches of `num_views` views of `width` by `height` pixels.
     ///
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
-    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+    pub fn num_patches(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
         let patch_size = self.patch_size;
         if height == 0 || width == 0 || !height.is_multiple_of(patch_size) || !width.is_multiple_of(patch_size) {
             return Err(ModelError::NotDivisible { width, height, patch_size });
         }
         Ok(num_views * (height / patch_size) * (width / patch_size))
+    }
+
+    /// Returns the number of encoder tokens of `num_views` context views: one per patch, or the latents of LVSM.
+    ///
+    /// # Errors
+    /// As [`num_patches`](Self::num_patches).
+    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+        let num_patches = self.num_patches(num_views, height, width)?;
+        Ok(if self.has_latents() { self.num_latents } else { num_patches })
+    }
+
+    /// Whether the tokens of a scene are learned latents, which belong to no patch and no camera: they are neither clustered
+    /// nor condensed nor selected.
+    pub fn has_latents(&self) -> bool {
+        self.architecture == Architecture::LvsmEd
+    }
+
+    /// Whether linear layers and layer norms have biases.
+    pub(crate) fn has_biases(&self) -> bool {
+        !self.has_latents() || self.variant.is_released()
+    }
+
+    /// Whether the encoder reads colours in `[-1, 1]` instead of `[0, 1]`.
+    pub(crate) fn has_signed_colors(&self) -> bool {
+        self.has_latents() && !self.variant.is_released()
+    }
+
+    /// Whether the heads of queries and keys have norms.
+    pub(crate) fn has_query_key_norms(&self) -> bool {
+        self.variant.has_norms() || !self.has_biases()
+    }
+
+    /// Whether the encoder's tokens have a norm.
+    pub(crate) fn has_token_norm(&self) -> bool {
+        self.variant.has_norms()
+    }
+
+    /// Whether the condenser is that of the released code.
+    pub(crate) fn has_released_condenser(&self) -> bool {
+        !self.has_latents() && self.variant.is_released()
     }
 
     /// Checks every value against its range.
@@ -154,8 +220,21 @@ impl ModelConfig {
             ("model.num_encoder_blocks", self.num_encoder_blocks, 1 << 10),
             ("model.num_renderer_blocks", self.num_renderer_blocks, 1 << 10),
             ("model.patch_size", self.patch_size, 256),
+            ("model.num_latents", self.num_latents, 1 << 16),
             ("model.condenser.num_blocks", self.condenser.num_blocks, 64),
         ] {
+            let is_other = match key {
+                "model.num_latents" => !self.has_latents(),
+                "model.condenser.num_blocks" => self.has_latents(),
+                _ => false,
+            };
+            if is_other {
+                if value > 0 {
+                    let fix = format!("model.architecture = \"{}\" has none: leave the key out", self.architecture);
+                    return bad(key, value.to_string(), fix);
+                }
+                continue;
+            }
             if value == 0 {
                 return bad(key, value.to_string(), "write at least 1".into());
             }
@@ -170,8 +249,12 @@ impl ModelConfig {
         }
         if self.camera_encoding != CameraEncoding::Plucker {
             let key = "model.camera_encoding";
-            if variant.is_released() {
-                let fix = format!("model.variant = \"{variant}\" has \"plucker\": leave the key out");
+            let owner = match self.architecture {
+                Architecture::LvsmEd => Some("model.architecture = \"lvsm-ed\"".to_owned()),
+                Architecture::Clift => variant.is_released().then(|| format!("model.variant = \"{variant}\"")),
+            };
+            if let Some(owner) = owner {
+                let fix = format!("{owner} has \"plucker\": leave the key out");
                 return bad(key, self.camera_encoding.to_string(), fix);
             }
             if !(dim / num_heads).is_multiple_of(8) {
@@ -179,6 +262,10 @@ impl ModelConfig {
                     format!("needs heads of a multiple of 8 channels, not {}: change model.num_heads", dim / num_heads);
                 return bad(key, self.camera_encoding.to_string(), fix);
             }
+        }
+        if self.has_latents() {
+            let fix = "of LVSM, write \"paper\" or \"released-re10k\", its network in CLiFT's release".to_owned();
+            return if variant.has_norms() { bad("model.variant", variant.to_string(), fix) } else { Ok(()) };
         }
         let CondenserConfig { num_blocks, residual } = self.condenser;
         if variant.is_released() && num_blocks != 1 {
@@ -192,6 +279,9 @@ impl ModelConfig {
         Ok(())
     }
 }
+
+/// Latents of LVSM by default, as published.
+const LATENTS: usize = 3072;
 
 /// Returns the divisors of `number` next to `wrong` as text.
 fn near_divisors(number: usize, wrong: usize) -> String {
@@ -240,8 +330,42 @@ mod tests {
     }
 
     #[test]
+    fn lvsm_has_its_own_sizes_and_no_condenser() {
+        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
+        for (variant, sizes) in [("paper", [768, 12, 3072, 3072]), ("released-re10k", [512, 8, 2048, 3072])] {
+            let config = parse(&format!(r#"{{"architecture": "lvsm-ed", "variant": "{variant}"}}"#));
+            config.validate().expect("valid");
+            assert_eq!([config.dim, config.num_heads, config.feed_forward_dim, config.num_latents], sizes);
+            assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 3072);
+            assert_eq!(config.num_patches(4, 256, 256).expect("divides"), 4096);
+            assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
+        }
+        let message = |text: &str| parse(text).validate().unwrap_err().to_string();
+        let cases = [
+            (r#"{"num_latents": 5}"#, "`model.num_latents` = 5: model.architecture = \"clift\" has none"),
+            (r#"{"architecture": "lvsm-ed", "num_latents": 0}"#, "`model.num_latents` = 0: write at least 1"),
+            (
+                r#"{"architecture": "lvsm-ed", "condenser": {"num_blocks": 2}}"#,
+                "`model.condenser.num_blocks` = 2: model.architecture = \"lvsm-ed\" has none",
+            ),
+            (
+                r#"{"architecture": "lvsm-ed", "variant": "released-dl3dv"}"#,
+                "`model.variant` = released-dl3dv: of LVSM, write \"paper\"",
+            ),
+            (
+                r#"{"architecture": "lvsm-ed", "camera_encoding": "gta"}"#,
+                "`model.camera_encoding` = gta: model.architecture = \"lvsm-ed\" has \"plucker\"",
+            ),
+        ];
+        for (text, expected) in cases {
+            assert!(message(text).starts_with(expected), "{}", message(text));
+        }
+        assert!(!serde_json::to_string(&ModelConfig::default()).expect("JSON").contains("latents"), "former files");
+    }
+
+    #[test]
     fn an_image_of_partial_patches_is_an_error() {
-        let error = ModelConfig::default().num_tokens(1, 250, 256).unwrap_err();
+        let error = ModelConfig::default().num_patches(1, 250, 256).unwrap_err();
         assert_eq!(error.to_string(), "an image of 256 x 250 does not divide into patches of 8 x 8");
         assert!(ModelConfig::default().num_tokens(1, 0, 256).is_err());
         assert_eq!(ModelConfig::default().num_tokens(4, 256, 448).expect("divides"), 7168);

@@ -1,7 +1,7 @@
 //! The multi-view encoder: context views to light-field tokens (paper section 3.1).
-// B scenes, V views, N tokens, D width
+// B scenes, V views, N patches, L latents, D width
 
-use burn::module::Module;
+use burn::module::{Module, Param};
 use burn::nn::Linear;
 use burn::tensor::Tensor;
 
@@ -19,33 +19,47 @@ use crate::views::upload::{Cameras, Views};
 /// one variant applies a [`LiftNorm`](crate::LiftNorm) to it.
 #[derive(Module, Debug)]
 pub struct Encoder {
+    /// Learned tokens `[1, L, D]` of LVSM, which are encoded in place of the patches.
+    latents: Option<Latents>,
     patch_embed: Linear,
     blocks: Vec<EncoderBlock>,
+    #[module(skip)]
+    has_signed_colors: bool,
     #[module(skip)]
     patch_size: usize,
     #[module(skip)]
     transforms: TransformMaker,
 }
 
+/// Learned tokens.
+#[derive(Module, Debug)]
+struct Latents {
+    /// `[1, L, D]`
+    weight: Param<Tensor<3>>,
+}
+
 impl Encoder {
     /// Makes an encoder of the sizes of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self {
-            patch_embed: init.linear(config.context_patch_len(), config.dim),
-            blocks: (0..config.num_encoder_blocks).map(|_| EncoderBlock::new(config, init)).collect(),
+            latents: config.has_latents().then(|| Latents { weight: init.latents(config.num_latents, config.dim) }),
+            patch_embed: init.block(None).linear(config.context_patch_len(), config.dim),
+            blocks: (0..config.num_encoder_blocks).map(|i| EncoderBlock::new(config, init.block(Some(i)))).collect(),
+            has_signed_colors: config.has_signed_colors(),
             patch_size: config.patch_size,
             transforms: TransformMaker::new(config),
         }
     }
 
-    /// Encodes context views into light-field tokens, one per patch.
+    /// Encodes context views into light-field tokens, one per patch, or into the latents.
     ///
     /// # Shapes
-    /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
+    /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column; or
+    ///   `[batch, num_latents, dim]`
     pub fn forward(&self, context: &Views) -> Tokens {
         let transforms = self.transforms(&context.cameras);
-        let values = self.blocks.iter().fold(self.embed(context), |x, block| block.forward(x, transforms.as_ref()));
-        Tokens { values, transforms }
+        let x = self.blocks.iter().fold(self.embed(context), |x, block| block.forward(x, transforms.as_ref()));
+        Tokens { values: self.to_tokens(x), transforms }
     }
 
     /// Makes the transforms of the tokens for camera-relative attention; `None` without it.
@@ -53,14 +67,31 @@ impl Encoder {
         self.transforms.of_views(context)
     }
 
-    /// Embeds patches and rays: the input of the first block, in the shape of [`forward`](Self::forward)'s result.
+    /// Embeds patches and rays, after the latents if there are some: the input of the first block, `[batch, rows, dim]`.
     pub fn embed(&self, context: &Views) -> Tensor<3> {
-        let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
-        linear_in_f32(&self.patch_embed, patchify(pixels, self.patch_size))
+        let colors = context.images.clone();
+        let colors = if self.has_signed_colors { colors * 2.0 - 1.0 } else { colors };
+        let pixels = Tensor::cat(vec![colors, plucker(&context.cameras)], 4); // [B, V, H, W, 9]
+        let patches = linear_in_f32(&self.patch_embed, patchify(pixels, self.patch_size));
+        let Some(Latents { weight }) = &self.latents else { return patches };
+        let ([batch, ..], [_, count, dim]) = (patches.dims(), weight.dims());
+        Tensor::cat(vec![weight.val().expand([batch, count, dim]), patches], 1) // [B, L + N, D]
     }
 
     /// Returns the blocks after [`embed`](Self::embed).
     pub fn blocks(&self) -> &[EncoderBlock] {
         &self.blocks
+    }
+
+    /// Returns the tokens of a scene, given the output of the last block.
+    ///
+    /// # Shapes
+    /// - `x`: `[batch, rows, dim]`, as [`embed`](Self::embed) returns
+    /// - returns `[batch, num_tokens, dim]`
+    pub fn to_tokens(&self, x: Tensor<3>) -> Tensor<3> {
+        match &self.latents {
+            Some(Latents { weight }) => x.narrow(1, 0, weight.dims()[1]),
+            None => x,
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! Initial weights, sampled on the host: a seed gives the same network on every device.
 //!
 //! The distributions are PyTorch's: linear layers uniform in `+-1/sqrt(inputs)`, packed attention projections
-//! Xavier-uniform with zero bias. All blocks of the released code start with the same weights; here every block has its
+//! Xavier-uniform with zero bias. Networks without biases are LVSM's: all matrices are normal. All blocks of the released code start with the same weights; here every block has its
 //! own.
 
 use burn::module::Param;
@@ -10,21 +10,53 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::network::config::ModelConfig;
+
 /// A source of initialized layers on a device. All layers share one stream of random numbers.
 #[derive(Debug)]
 pub struct Init {
     device: Device,
     rng: ChaCha8Rng,
+    /// Standard deviation of LVSM's matrices, whose layers have no bias; `None` for PyTorch's distributions.
+    deviation: Option<f64>,
 }
 
+/// Standard deviation of LVSM's matrices outside the blocks, and of its latents.
+const DEVIATION: f64 = 0.02;
+
 impl Init {
-    /// Starts the stream of `seed`.
+    /// Starts the stream of `seed` for layers with biases.
     pub fn new(seed: u64, device: &Device) -> Self {
-        Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed) }
+        Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed), deviation: None }
+    }
+
+    /// Starts the stream of `seed` for the layers of a network.
+    pub fn of(config: &ModelConfig, seed: u64, device: &Device) -> Self {
+        Self { deviation: (!config.has_biases()).then_some(DEVIATION), ..Self::new(seed, device) }
+    }
+
+    /// Starts a transformer block by its index, or the layers outside the blocks: LVSM's matrices get smaller with depth.
+    pub(crate) fn block(&mut self, index: Option<usize>) -> &mut Self {
+        let factor = index.map_or(1.0, |index| (2.0 * (index + 1) as f64).sqrt());
+        self.deviation = self.deviation.map(|_| DEVIATION / factor);
+        self
+    }
+
+    /// Makes learned tokens, `[1, count, dim]`: normal with deviation 0.02, cut at two deviations.
+    pub(crate) fn latents(&mut self, count: usize, dim: usize) -> Param<Tensor<3>> {
+        let mut sample = || {
+            let cut = std::iter::repeat_with(|| self.normal()).find(|value| value.abs() <= 2.0);
+            (DEVIATION * cut.expect("without end")) as f32
+        };
+        let values: Vec<f32> = (0..count * dim).map(|_| sample()).collect();
+        Param::from_tensor(Tensor::from_data(TensorData::new(values, [1, count, dim]), &self.device))
     }
 
     /// Makes a linear layer with bias, both uniform in `+-1/sqrt(inputs)`.
     pub fn linear(&mut self, inputs: usize, outputs: usize) -> Linear {
+        if let Some(deviation) = self.deviation {
+            return self.normal_linear(inputs, outputs, deviation);
+        }
         let bound = 1.0 / (inputs as f64).sqrt();
         Linear { weight: self.uniform([inputs, outputs], bound), bias: Some(self.uniform([outputs], bound)) }
     }
@@ -32,12 +64,18 @@ impl Init {
     /// Makes a packed attention projection of `parts` matrices `[dim, dim]`: Xavier-uniform for the whole `[dim, 3 dim]`
     /// matrix of queries, keys and values, with zero bias.
     pub fn attention_in(&mut self, dim: usize, parts: usize) -> Linear {
+        if let Some(deviation) = self.deviation {
+            return self.normal_linear(dim, parts * dim, deviation);
+        }
         let bound = (6.0 / (4 * dim) as f64).sqrt();
         Linear { weight: self.uniform([dim, parts * dim], bound), bias: Some(self.zeros([parts * dim])) }
     }
 
     /// Makes the projection after attention: uniform weight, zero bias.
     pub fn attention_out(&mut self, dim: usize) -> Linear {
+        if let Some(deviation) = self.deviation {
+            return self.normal_linear(dim, dim, deviation);
+        }
         let bound = 1.0 / (dim as f64).sqrt();
         Linear { weight: self.uniform([dim, dim], bound), bias: Some(self.zeros([dim])) }
     }
@@ -59,7 +97,19 @@ impl Init {
 
     /// Makes a layer norm with epsilon 1e-5.
     pub fn layer_norm(&mut self, dim: usize) -> LayerNorm {
-        LayerNormConfig::new(dim).init(&self.device)
+        LayerNormConfig::new(dim).with_bias(self.deviation.is_none()).init(&self.device)
+    }
+
+    fn normal_linear(&mut self, inputs: usize, outputs: usize, deviation: f64) -> Linear {
+        let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * self.normal()) as f32).collect();
+        let weight = Tensor::from_data(TensorData::new(values, [inputs, outputs]), &self.device);
+        Linear { weight: Param::from_tensor(weight), bias: None }
+    }
+
+    /// Samples the normal distribution (Box and Muller).
+    fn normal(&mut self) -> f64 {
+        let [radius, angle] = [(); 2].map(|()| self.rng.random::<f64>());
+        (-2.0 * (1.0 - radius).ln()).sqrt() * (std::f64::consts::TAU * angle).cos()
     }
 
     fn uniform<const D: usize>(&mut self, shape: [usize; D], bound: f64) -> Param<Tensor<D>> {
@@ -76,7 +126,8 @@ impl Init {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{devices, to_vec};
+    use crate::network::architecture::CliftVariant;
+    use crate::testing::{devices, small_lvsm, to_vec};
 
     #[test]
     fn weights_depend_on_the_seed_and_not_on_the_device() {
@@ -84,6 +135,24 @@ mod tests {
         let all: Vec<_> = devices().iter().map(|device| weights(7, device)).collect();
         assert!(all.windows(2).all(|pair| pair[0] == pair[1]));
         assert_ne!(all[0], weights(8, &devices()[0]));
+    }
+
+    #[test]
+    fn weights_of_lvsm_are_normal_and_shrink_with_depth() {
+        let deviation = |values: Vec<f64>| (values.iter().map(|x| x * x).sum::<f64>() / values.len() as f64).sqrt();
+        let mut init = Init::of(&small_lvsm(CliftVariant::Paper), 0, &Device::flex());
+        let mut of_block = |index| init.block(index).linear(100, 400);
+        assert!(of_block(None).bias.is_none());
+        for (index, expected) in [(None, 0.02), (Some(0), 0.02 / 2.0_f64.sqrt()), (Some(7), 0.005)] {
+            let got = deviation(to_vec(of_block(index).weight.val()));
+            assert!((got / expected - 1.0).abs() < 0.02, "{index:?}: {got}");
+        }
+        let latents = to_vec(init.latents(100, 400).val());
+        assert!(latents.iter().all(|value| value.abs() <= 0.04));
+        // A normal distribution cut at two deviations has 0.88 of its deviation.
+        assert!((deviation(latents) / (0.88 * 0.02) - 1.0).abs() < 0.02);
+        let stock = Init::of(&small_lvsm(CliftVariant::ReleasedRe10k), 0, &Device::flex()).linear(4, 4);
+        assert!(stock.bias.is_some(), "PyTorch's layers");
     }
 
     #[test]

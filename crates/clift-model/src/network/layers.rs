@@ -41,6 +41,8 @@ pub enum Part {
 pub enum Rows {
     /// Patches of all context views, and their tokens.
     ContextPatches,
+    /// Tokens that are encoded beside the patches.
+    Latents,
     /// Tokens that are not centroids.
     Members,
     /// Centroids.
@@ -61,8 +63,8 @@ pub type Sequence = &'static [Rows];
 pub enum LayerKind {
     /// Matrix product.
     Linear { inputs: usize, outputs: usize, bias: bool },
-    /// Layer norm with scale and shift.
-    LayerNorm { width: usize },
+    /// Layer norm with scale and, with `bias`, shift.
+    LayerNorm { width: usize, bias: bool },
     /// RMS norm of every head of queries or keys; the heads share one scale.
     HeadNorm { width: usize, heads: usize },
     /// Softmax attention of every row to all keys of its group.
@@ -71,6 +73,8 @@ pub enum LayerKind {
     ClusterAttention { width: usize, keys: Sequence },
     /// GELU or `ReLU` between the layers of a feed-forward network.
     Activation { width: usize },
+    /// Learned rows, beside the layer's input.
+    Table { rows: usize, width: usize },
 }
 
 impl Layer {
@@ -79,8 +83,9 @@ impl Layer {
         let shapes = match self.kind {
             LayerKind::Linear { inputs, outputs, bias: true } => vec![vec![outputs, inputs], vec![outputs]],
             LayerKind::Linear { inputs, outputs, bias: false } => vec![vec![outputs, inputs]],
-            LayerKind::LayerNorm { width } => vec![vec![width], vec![width]],
-            LayerKind::HeadNorm { width, .. } => vec![vec![width]],
+            LayerKind::LayerNorm { width, bias: true } => vec![vec![width], vec![width]],
+            LayerKind::LayerNorm { width, bias: false } | LayerKind::HeadNorm { width, .. } => vec![vec![width]],
+            LayerKind::Table { rows, width } => vec![vec![1, rows, width]],
             LayerKind::Attention { .. } | LayerKind::ClusterAttention { .. } | LayerKind::Activation { .. } => vec![],
         };
         let paths = ["weight", "bias"].map(|name| format!("{}.{name}", self.path));
@@ -97,7 +102,7 @@ impl ModelConfig {
     /// Lists every layer in the order of published checkpoints: encoder, token norm, renderer, condenser; within a block
     /// attention, feed-forward network, norms.
     pub(crate) fn layers(&self) -> Vec<Layer> {
-        clift_layers(self)
+        if self.has_latents() { lvsm_layers(self) } else { clift_layers(self) }
     }
 }
 
@@ -107,21 +112,45 @@ const STORED: Sequence = &[Rows::StoredTokens];
 const GATHERING: Sequence = &[Rows::GatheringTokens];
 const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
 const TARGETS: Sequence = &[Rows::TargetPatches];
+const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
+const TARGETS_AND_LATENTS: Sequence = &[Rows::TargetPatches, Rows::RenderTokens];
+
+fn lvsm_layers(config: &ModelConfig) -> Vec<Layer> {
+    let ModelConfig { dim, num_latents, .. } = *config;
+    let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
+
+    list.enter(Part::Encoder, None, "encoder");
+    list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
+    list.push("latents", LayerKind::Table { rows: num_latents, width: dim }, LATENTS_AND_CONTEXT, false);
+    for i in 0..config.num_encoder_blocks {
+        list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
+        list.encoder_block(LATENTS_AND_CONTEXT);
+    }
+
+    list.enter(Part::Renderer, None, "renderer");
+    list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
+    list.norm("joint.input_norm", if config.variant.is_released() { RENDER_TOKENS } else { TARGETS_AND_LATENTS });
+    for i in 0..config.num_renderer_blocks {
+        list.enter(Part::Renderer, Some(i), &format!("renderer.joint.blocks.{i}"));
+        list.encoder_block(TARGETS_AND_LATENTS);
+    }
+    list.enter(Part::Renderer, None, "renderer");
+    list.norm("output_norm", TARGETS);
+    list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
+    list.layers
+}
 
 fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
-    let ModelConfig { dim, variant, .. } = *config;
+    let dim = config.dim;
     let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
 
     list.enter(Part::Encoder, None, "encoder");
     list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
     for i in 0..config.num_encoder_blocks {
         list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
-        list.self_attention("attn", CONTEXT);
-        list.feed_forward(CONTEXT);
-        list.norm("norm_attn", CONTEXT);
-        list.norm("norm_ff", CONTEXT);
+        list.encoder_block(CONTEXT);
     }
-    if variant.has_norms() {
+    if config.has_token_norm() {
         list.enter(Part::TokenNorm, None, "lift_norm");
         list.norm("norm", CONTEXT);
     }
@@ -136,7 +165,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.norm("output_norm", TARGETS);
     list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
 
-    if variant.is_released() {
+    if config.has_released_condenser() {
         list.enter(Part::Condenser, Some(0), "condenser.released");
         list.decoder_block(STORED, CONTEXT);
         list.linear("gate", [dim, dim], STORED, true);
@@ -151,7 +180,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
             list.norm("norm_cross", GATHERING);
         }
         // All blocks share one copy of the members.
-        list.push("norm_memory", LayerKind::LayerNorm { width: dim }, MEMBERS, false);
+        list.push("norm_memory", LayerKind::LayerNorm { width: dim, bias: true }, MEMBERS, false);
         list.norm("norm_ff", STORED);
         list.cross_attention(GATHERING, !residual, MEMBERS);
         list.feed_forward(STORED);
@@ -180,11 +209,13 @@ impl LayerList<'_> {
     }
 
     fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
-        self.push(name, LayerKind::Linear { inputs, outputs, bias: true }, rows, saves_input);
+        let bias = self.config.has_biases();
+        self.push(name, LayerKind::Linear { inputs, outputs, bias }, rows, saves_input);
     }
 
     fn norm(&mut self, name: &str, rows: Sequence) {
-        self.push(name, LayerKind::LayerNorm { width: self.config.dim }, rows, true);
+        let bias = self.config.has_biases();
+        self.push(name, LayerKind::LayerNorm { width: self.config.dim, bias }, rows, true);
     }
 
     /// Adds self-attention after a norm, with one packed projection.
@@ -209,9 +240,9 @@ impl LayerList<'_> {
     }
 
     fn attention_output(&mut self, name: &str, rows: Sequence, keys: Sequence) {
-        let ModelConfig { dim, num_heads: heads, variant, .. } = *self.config;
+        let ModelConfig { dim, num_heads: heads, .. } = *self.config;
         self.linear(&format!("{name}.out_proj"), [dim, dim], rows, true);
-        if variant.has_norms() && self.part != Part::Condenser {
+        if self.config.has_query_key_norms() && self.part != Part::Condenser {
             let norm = LayerKind::HeadNorm { width: dim / heads, heads };
             self.push(&format!("{name}.qk_norm.query"), norm, rows, true);
             self.push(&format!("{name}.qk_norm.key"), norm, keys, true);
@@ -224,6 +255,14 @@ impl LayerList<'_> {
         self.linear("feed_forward.up", [dim, hidden], rows, false);
         self.push("feed_forward", LayerKind::Activation { width: hidden }, rows, true);
         self.linear("feed_forward.down", [hidden, dim], rows, false);
+    }
+
+    /// Adds PyTorch's pre-norm encoder layer.
+    fn encoder_block(&mut self, rows: Sequence) {
+        self.self_attention("attn", rows);
+        self.feed_forward(rows);
+        self.norm("norm_attn", rows);
+        self.norm("norm_ff", rows);
     }
 
     /// Adds PyTorch's pre-norm decoder layer.

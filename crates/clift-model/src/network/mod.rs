@@ -5,6 +5,9 @@
 //! `released_condenser` is the one of the published checkpoints; `render_tokens` holds the tokens of target views, and
 //! `renderer` decodes images from them; `clift` joins the three networks behind the interface of `scene_model`.
 //!
+//! In the encoder-decoder of LVSM, a baseline, the `encoder` encodes learned latents beside the patches, and the `renderer`
+//! decodes with `joint_decoder`.
+//!
 //! `tokens` are tokens with the transforms of camera-relative attention, which `camera_encoding` makes of the cameras.
 //!
 //! `blocks` holds the transformer layers, `init` their initial weights, and `layers` the description of every layer
@@ -18,6 +21,7 @@ pub(crate) mod condenser;
 pub(crate) mod config;
 pub(crate) mod encoder;
 pub(crate) mod init;
+pub(crate) mod joint_decoder;
 pub(crate) mod layers;
 pub(crate) mod released_condenser;
 pub(crate) mod render_tokens;

@@ -6,11 +6,13 @@ use crate::network::blocks::block::DecoderBlock;
 use crate::network::camera_encoding::upload_ids;
 use crate::network::tokens::Tokens;
 
-/// Keys and values of a scene's tokens in every block of a renderer.
+/// Keys and values of a scene's tokens in every block of a renderer; the tokens themselves for LVSM's, which mixes them with
+/// the patches of every view.
 #[derive(Clone, Debug)]
 pub struct KeyValueCache {
     /// One tensor per block, `[batch, num_render_tokens, 2 dim]`.
     pub(crate) blocks: Vec<Tensor<3>>,
+    pub(crate) tokens: Option<Tokens>,
     pub(crate) num_render_tokens: usize,
 }
 
@@ -23,7 +25,7 @@ impl KeyValueCache {
         };
         let indices = upload_ids(tokens, &first.device());
         let blocks = self.blocks.iter().map(|key_value| key_value.clone().select(1, indices.clone())).collect();
-        Self { blocks, num_render_tokens: tokens.len() }
+        Self { blocks, tokens: self.tokens.as_ref().map(|all| all.select(tokens)), num_render_tokens: tokens.len() }
     }
 }
 
@@ -81,6 +83,14 @@ impl RenderTokens {
     /// Returns the values of the tokens that keys and values are projected from.
     pub fn values(&self) -> &Tensor<3> {
         &self.tokens.values
+    }
+
+    /// Returns the tokens of every set, `[groups, num_render_tokens, dim]`.
+    pub(crate) fn sets(&self) -> Tensor<3> {
+        match &self.rows {
+            Some(rows) => gather(self.tokens.values.clone(), rows.clone()),
+            None => self.tokens.values.clone(),
+        }
     }
 
     /// Projects the keys and values of every set for a block, `[groups, num_render_tokens, 2 dim]`.

@@ -10,6 +10,7 @@ use crate::network::blocks::block::DecoderBlock;
 use crate::network::camera_encoding::{TokenTransforms, TransformMaker};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
+use crate::network::joint_decoder::JointDecoder;
 use crate::network::render_tokens::{KeyValueCache, RenderTokens};
 use crate::network::tokens::Tokens;
 use crate::ops::linear::{linear_in_f32, norm_linear};
@@ -17,11 +18,14 @@ use crate::views::patch::{patchify, unpatchify};
 use crate::views::rays::plucker;
 use crate::views::upload::Cameras;
 
-/// A transformer decoder whose queries are the ray patches of a target view.
+/// A transformer decoder whose queries are the ray patches of a target view, or LVSM's joint decoder.
 #[derive(Module, Debug)]
 pub struct Renderer {
     ray_embed: Linear,
+    /// Empty in LVSM.
     blocks: Vec<DecoderBlock>,
+    /// The blocks of LVSM.
+    joint: Option<JointDecoder>,
     output_norm: LayerNorm,
     to_pixels: Linear,
     #[module(skip)]
@@ -33,14 +37,21 @@ pub struct Renderer {
 impl Renderer {
     /// Makes a renderer of the sizes of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        let num_blocks = if config.has_latents() { 0 } else { config.num_renderer_blocks };
         Self {
-            ray_embed: init.linear(config.ray_patch_len(), config.dim),
-            blocks: (0..config.num_renderer_blocks).map(|_| DecoderBlock::new(config, init)).collect(),
+            ray_embed: init.block(None).linear(config.ray_patch_len(), config.dim),
+            blocks: (0..num_blocks).map(|_| DecoderBlock::new(config, init)).collect(),
+            joint: JointDecoder::new(config, init),
             output_norm: init.layer_norm(config.dim),
-            to_pixels: init.linear(config.dim, config.rgb_patch_len()),
+            to_pixels: init.block(None).linear(config.dim, config.rgb_patch_len()),
             patch_size: config.patch_size,
             transforms: TransformMaker::new(config),
         }
+    }
+
+    /// Whether views are decoded together with all tokens, as in LVSM.
+    pub(crate) fn is_joint(&self) -> bool {
+        self.joint.is_some()
     }
 
     /// Returns the side of a patch in pixels.
@@ -56,8 +67,8 @@ impl Renderer {
     pub fn forward(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         let tokens = tokens.into();
         let transforms = self.transforms(targets);
-        let forward = |x, block: &DecoderBlock| block.forward(x, tokens.project(block), transforms.as_ref());
-        self.to_image(self.blocks.iter().fold(self.embed(targets), forward), targets)
+        let block = |x, block| self.block(block, x, &tokens, transforms.as_ref());
+        self.to_image((0..self.num_blocks()).fold(self.embed(&tokens, targets), block), targets)
     }
 
     /// Makes the transforms of the patches of target views for camera-relative attention, one sequence per view; `None`
@@ -73,7 +84,8 @@ impl Renderer {
     /// - `tokens`: `[batch, num_render_tokens, dim]`
     pub fn project_tokens(&self, tokens: &Tokens) -> KeyValueCache {
         let blocks = self.blocks.iter().map(|block| block.project_tokens(tokens.clone())).collect();
-        KeyValueCache { blocks, num_render_tokens: tokens.dims()[1] }
+        let tokens_of_joint = self.joint.is_some().then(|| tokens.clone());
+        KeyValueCache { blocks, tokens: tokens_of_joint, num_render_tokens: tokens.dims()[1] }
     }
 
     /// Renders target views as [`forward`](Self::forward) does, from the keys and values of
@@ -82,35 +94,68 @@ impl Renderer {
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
-        let x = self.embed(targets);
+        if let Some(tokens) = &cache.tokens {
+            return self.forward(tokens.clone(), targets);
+        }
+        let x = self.embed_rays(targets);
         let transforms = self.transforms(targets);
         let blocks = self.blocks.iter().zip(&cache.blocks);
         let x = blocks.fold(x, |x, (block, key_value)| block.forward(x, key_value.clone(), transforms.as_ref()));
         self.to_image(x, targets)
     }
 
-    /// Embeds the rays of every patch: the input of the first block, `[batch * views, num_queries, dim]`.
-    pub fn embed(&self, targets: &Cameras) -> Tensor<3> {
+    /// Embeds the rays of every patch, before the tokens in LVSM: the input of the first block,
+    /// `[batch * views, rows, dim]`.
+    pub fn embed(&self, tokens: &RenderTokens, targets: &Cameras) -> Tensor<3> {
+        let rays = self.embed_rays(targets);
+        match &self.joint {
+            Some(joint) => joint.join(rays, tokens.sets()),
+            None => rays,
+        }
+    }
+
+    /// `[batch * views, num_queries, dim]`
+    fn embed_rays(&self, targets: &Cameras) -> Tensor<3> {
         let [batch, views] = targets.dims();
         let rays = linear_in_f32(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
         let [_, queries, dim] = rays.dims();
         rays.reshape([batch * views, queries / views, dim])
     }
 
-    /// Returns the blocks between [`embed`](Self::embed) and [`to_image`](Self::to_image).
-    pub fn blocks(&self) -> &[DecoderBlock] {
-        &self.blocks
+    /// Returns the number of blocks between [`embed`](Self::embed) and [`to_image`](Self::to_image).
+    pub fn num_blocks(&self) -> usize {
+        self.joint.as_ref().map_or(self.blocks.len(), |joint| joint.blocks.len())
+    }
+
+    /// Applies a block to the patches of target views.
+    ///
+    /// # Shapes
+    /// - `x` and the result: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
+    pub fn block(
+        &self,
+        block: usize,
+        x: Tensor<3>,
+        tokens: &RenderTokens,
+        transforms: Option<&TokenTransforms>,
+    ) -> Tensor<3> {
+        if let Some(joint) = &self.joint {
+            return joint.blocks[block].forward(x, None);
+        }
+        let block = &self.blocks[block];
+        block.forward(x, tokens.project(block), transforms)
     }
 
     /// Decodes the output of the last block into images.
     ///
     /// # Shapes
-    /// - `x`: `[batch * views, num_queries, dim]`
+    /// - `x`: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn to_image(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
         let [batch, views] = targets.dims();
+        let num_queries = targets.height / self.patch_size * (targets.width / self.patch_size);
+        let x = if self.joint.is_some() { x.narrow(1, 0, num_queries) } else { x };
         let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x));
-        let [_, num_queries, values] = patches.dims();
+        let [_, _, values] = patches.dims();
         let patches = patches.reshape([batch, views * num_queries, values]);
         unpatchify(patches, [views, targets.height, targets.width], self.patch_size)
     }

@@ -14,6 +14,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::module::Param;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Tensor, assert_shape};
 use clift_kernels::{InstructionSet, linear_forward, sum_rows};
@@ -25,14 +26,11 @@ use crate::ops::layer_norm::{LayerNormKernels, NormState};
 use crate::ops::mac_counter;
 use crate::ops::precision::{MatmulKernels, Precision};
 
-/// Computes `x W + b`.
+/// Computes `x W + b`, with `b = 0` for a layer without bias.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
-///
-/// # Panics
-/// If the layer has no bias.
 pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: false, precision: Precision::current() })
 }
@@ -47,23 +45,20 @@ pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
-///
-/// # Panics
-/// If the layer has no bias.
 pub fn gelu_linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: true, precision: Precision::current() })
 }
 
-/// Computes `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` per row.
+/// Computes `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` per row, with `beta = 0` for
+/// a norm without bias.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
-///
-/// # Panics
-/// If the norm or the layer has no bias.
 pub fn norm_linear(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    norm_then_linear(x, norm.gamma.val(), norm.beta.as_ref().expect("the norm has a bias").val(), layer)
+    let gamma = norm.gamma.val();
+    let beta = norm.beta.as_ref().map_or_else(|| gamma.clone().detach().zeros_like(), Param::val);
+    norm_then_linear(x, gamma, beta, layer)
 }
 
 /// The computation before the bias of a layer is added.
@@ -94,11 +89,12 @@ pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, 
     ))
 }
 
-/// Returns weight and bias of a layer with input `x`, and counts its multiply-accumulates.
+/// Returns weight and bias, zeros without one, of a layer with input `x`, and counts its multiply-accumulates.
 fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
     let weight = layer.weight.val();
-    let bias = layer.bias.as_ref().expect("the layer has a bias").val();
     let ([inputs, outputs], [batch, count, _]) = (weight.dims(), x.dims());
+    let no_bias = || Tensor::zeros([outputs], (&weight.device(), weight.dtype()));
+    let bias = layer.bias.as_ref().map_or_else(no_bias, Param::val);
     assert_shape!(x, [.., inputs]);
     mac_counter::add_linear(batch * count, inputs, outputs);
     (weight, bias)

@@ -1,6 +1,7 @@
 //! Rules of a valid scene, checked before a scene is written and after it is read, because files may be hostile.
 
 use crate::scene::scene::{HEADER_BYTES, Scene};
+use crate::tokens::kind::TokenKind;
 use crate::views::camera::ViewCamera;
 
 const MAX_VIEWS: usize = 1024;
@@ -54,7 +55,7 @@ impl Scene {
                 self.width, self.height
             ));
         }
-        let num_patches = self.model.num_tokens(views, self.height, self.width).map_err(|error| error.to_string())?;
+        let num_patches = self.model.num_patches(views, self.height, self.width).map_err(|error| error.to_string())?;
         if num_patches > MAX_PATCHES {
             return Err(format!("{num_patches} patches of context views, expected at most {MAX_PATCHES}"));
         }
@@ -63,6 +64,14 @@ impl Scene {
 
     fn check_tokens(&self, num_patches: usize) -> Result<(), String> {
         let (count, dim) = (self.num_tokens(), self.model.dim);
+        if self.model.has_latents() != (self.kind == TokenKind::Latents) {
+            return Err(format!("{} tokens of a network of {}", self.kind, self.model.architecture));
+        }
+        if self.model.has_latents() && !self.token_ids.iter().copied().eq(0..self.model.num_latents as u32) {
+            return Err(format!("{count} tokens, expected all {} latents in order", self.model.num_latents));
+        }
+        // The places of latents are their indices.
+        let num_patches = if self.model.has_latents() { count } else { num_patches };
         if !(1..=num_patches).contains(&count) {
             return Err(format!("{count} tokens, expected 1 to {num_patches}, the number of patches"));
         }

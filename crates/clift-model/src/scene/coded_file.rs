@@ -48,7 +48,7 @@ impl Scene {
         let ids: Vec<u32> = order.iter().map(|&token| self.token_ids[token]).collect();
         let tokens: Vec<f32> =
             order.iter().flat_map(|&token| &self.tokens[token * dim..(token + 1) * dim]).copied().collect();
-        let num_patches = self.model.num_tokens(self.context.len(), self.height, self.width)?;
+        let num_patches = self.model.num_patches(self.context.len(), self.height, self.width)?;
         let words = codec.encode(&tokens, &ids, num_patches, step)?;
 
         let mut body = step.to_le_bytes().to_vec();

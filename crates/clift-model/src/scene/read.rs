@@ -88,7 +88,7 @@ fn from_bytes(
         let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
         let codec = find_codec(fields.get("model_path")?).map_err(|reason| refusal(reason, GIVE_MODEL))?;
         let (scene, step) = from_coded_bytes(bytes, body, &fields, &codec)?;
-        let num_patches = scene.model.num_tokens(scene.context.len(), scene.height, scene.width).unwrap_or(1);
+        let num_patches = scene.model.num_patches(scene.context.len(), scene.height, scene.width).unwrap_or(1);
         let loss = codec.rates.loss(scene.num_tokens() as f64 / num_patches as f64, f64::from(step));
         return Ok((scene, TokenCoding::Coded(CodedLoss::from_db(loss))));
     }
@@ -102,7 +102,7 @@ fn from_bytes(
         serde_json::from_str(fields.get("model")?).map_err(|error| format!("unreadable `model` ({error})"))?;
 
     let tensors = Tensors(file);
-    let (format, num_tokens, tokens) = tensors.tokens(model.dim)?;
+    let (format, num_tokens, tokens) = tensors.tokens(&model)?;
     let views = tensors.length("context_frames")?;
     let poses = tensors.f64s("context_c2w", &[views, 4, 4])?;
     let intrinsics = tensors.f64s("context_intrinsics", &[views, 4])?;
@@ -119,12 +119,18 @@ fn from_bytes(
         context: cameras.map(|(&c2w, &intrinsics)| ViewCamera { c2w, intrinsics }).collect(),
         context_frames: tensors.u32s("context_frames", &[views])?,
         world: SceneNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
-        token_ids: tensors.u32s("token_ids", &[num_tokens])?,
+        token_ids: if model.has_latents() {
+            (0..num_tokens as u32).collect()
+        } else {
+            tensors.u32s("token_ids", &[num_tokens])?
+        },
         tokens,
         model,
     };
     scene.check()?;
-    check_rays(&scene, &tensors.f32s("token_rays", &[num_tokens, 6])?)?;
+    if !scene.model.has_latents() {
+        check_rays(&scene, &tensors.f32s("token_rays", &[num_tokens, 6])?)?;
+    }
     Ok((scene, format.into()))
 }
 
@@ -195,15 +201,23 @@ impl Tensors<'_> {
         Ok(data.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect())
     }
 
-    fn tokens(&self, dim: usize) -> Result<(TokenFormat, usize, Vec<f32>), String> {
+    fn tokens(&self, model: &ModelConfig) -> Result<(TokenFormat, usize, Vec<f32>), String> {
+        let dim = model.dim;
         let dtype = self.view("tokens")?.dtype();
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));
         let format = format.ok_or_else(|| format!("`tokens` is {dtype:?}, expected F32, F16 or I8"))?;
-        let expected = if format == TokenFormat::Int8 { 9 } else { 8 };
+        let places = if model.has_latents() { 0 } else { 2 };
+        let expected = 6 + places + usize::from(format == TokenFormat::Int8);
         if self.0.len() != expected {
             return Err(format!("{} tensors, expected {expected}", self.0.len()));
         }
-        let count = self.length("token_ids")?;
+        let count = if model.has_latents() {
+            // Their number is in the header alone, and bounds what is allocated.
+            model.validate().map_err(|error| error.to_string())?;
+            model.num_latents
+        } else {
+            self.length("token_ids")?
+        };
         let scales = if format == TokenFormat::Int8 { self.f32s("token_scales", &[count])? } else { Vec::new() };
         if let Some(token) = scales.iter().position(|scale| !(scale.is_finite() && *scale >= 0.0)) {
             return Err(format!("scale {} of token {token}, expected a finite number", scales[token]));

@@ -113,7 +113,8 @@ impl SceneRenderer {
     /// the scene has no more. Frames of all tokens are rendered [`Self::frames_per_call`] at a time.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens,
+    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, and for
+    /// fewer latents of LVSM than all,
     /// [`ModelError::Device`] if an image cannot be read from the device.
     ///
     /// # Panics
@@ -126,6 +127,13 @@ impl SceneRenderer {
         num_render_tokens: usize,
     ) -> Result<Vec<RenderedView>, ModelError> {
         let mut rendered = Vec::with_capacity(views.len());
+        if num_render_tokens < self.num_storage_tokens() && self.renderer.is_joint() {
+            let fix = format!(
+                "the latents of lvsm-ed belong to no view, so that none can be selected by the camera: render from all {}",
+                self.num_storage_tokens()
+            );
+            return Err(ModelError::BadConfig { key: "num_render_tokens", value: num_render_tokens.to_string(), fix });
+        }
         if num_render_tokens >= self.num_storage_tokens() {
             for views in views.chunks(self.frames_per_call(height, width)) {
                 rendered.extend(self.render_call(views, height, width, None, 0.0)?);

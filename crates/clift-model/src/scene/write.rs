@@ -85,13 +85,18 @@ impl Scene {
             ),
             ("world_mean_c2w", "F64", vec![4, 4], f64_bytes(&mut self.world.mean_c2w.into_iter())),
             ("world_scale", "F64", vec![1], f64_bytes(&mut [self.world.scale].into_iter())),
-            ("token_rays", "F32", vec![count, 6], f32_bytes(&rays)),
         ];
+        let has_places = !self.model.has_latents();
+        if has_places {
+            tensors.push(("token_rays", "F32", vec![count, 6], f32_bytes(&rays)));
+        }
         if let Some(scales) = scales {
             tensors.push(("token_scales", "F32", vec![count], f32_bytes(&scales)));
         }
         tensors.push(("context_frames", "U32", vec![views], u32_bytes(&self.context_frames)));
-        tensors.push(("token_ids", "U32", vec![count], u32_bytes(&self.token_ids)));
+        if has_places {
+            tensors.push(("token_ids", "U32", vec![count], u32_bytes(&self.token_ids)));
+        }
         tensors.push(("tokens", dtype_name(format), vec![count, self.model.dim], tokens));
 
         let mut header = self.metadata().map_err(refuse)?;

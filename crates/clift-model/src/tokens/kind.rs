@@ -1,4 +1,4 @@
-//! Condensed tokens or K-means tokens.
+//! Condensed tokens, K-means tokens or latents.
 
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -10,6 +10,8 @@ pub enum TokenKind {
     Clift,
     /// The tokens nearest to the K-means centers, rendered with the renderer of stage 1.
     Kmeans,
+    /// All latents of LVSM, which has one stage.
+    Latents,
 }
 
 impl TokenKind {

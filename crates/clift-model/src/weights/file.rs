@@ -213,7 +213,9 @@ fn describe(error: &ApplyError) -> String {
     let ApplyError::ShapeMismatch { path, expected, found } = error else { return error.to_string() };
     let [expected, found] = [expected, found].map(|shape| {
         let mut sizes = shape.to_vec();
-        sizes.reverse();
+        if sizes.len() == 2 {
+            sizes.reverse();
+        }
         sizes
     });
     format!("{} is {found:?}, expected {expected:?}", name_in_file(path))

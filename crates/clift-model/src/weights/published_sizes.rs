@@ -6,7 +6,6 @@
 
 use std::collections::BTreeMap;
 
-use crate::network::architecture::CameraEncoding;
 use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
 use crate::weights::published_keys::{linear_shape, published_tensors};
@@ -54,8 +53,8 @@ fn probe(variant: CliftVariant) -> ModelConfig {
         num_encoder_blocks: 1,
         num_renderer_blocks: 1,
         patch_size: 8,
-        camera_encoding: CameraEncoding::Plucker,
         condenser: CondenserConfig { num_blocks: 1, residual: true },
+        ..ModelConfig::default()
     }
 }
 
@@ -122,8 +121,8 @@ pub fn infer_config<'a>(
         num_encoder_blocks: encoder.unwrap_or(published.num_encoder_blocks),
         num_renderer_blocks: renderer.unwrap_or(published.num_renderer_blocks),
         patch_size: patch.winner().map_or(published.patch_size, |(size, _)| size),
-        camera_encoding: CameraEncoding::Plucker,
         condenser: CondenserConfig::of(variant),
+        ..ModelConfig::default()
     };
     if variant == CliftVariant::Paper {
         config.condenser.num_blocks = condenser.unwrap_or(config.condenser.num_blocks);

@@ -76,7 +76,7 @@ pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Resu
     if needed > size {
         return Err(refuse(format!("the scene's renderer needs at least {needed} bytes, the file has {size}")));
     }
-    let mut renderer = Renderer::new(config, &mut Init::new(0, device));
+    let mut renderer = Renderer::new(config, &mut Init::of(config, 0, device));
     let missing = load_module(&mut renderer, "renderer", path)?.missing;
     if let Some(name) = missing.first() {
         let count = missing.len();
@@ -88,9 +88,10 @@ pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Resu
 /// Returns the bytes of the matrices in a renderer's blocks.
 fn min_renderer_bytes(config: &ModelConfig) -> u64 {
     let [dim, hidden, blocks] = [config.dim, config.feed_forward_dim, config.num_renderer_blocks].map(|n| n as u64);
-    // Four matrices each for self- and cross-attention, two for the feed-forward network, in f32. The largest valid sizes
-    // do not overflow.
-    4 * blocks * (8 * dim * dim + 2 * dim * hidden)
+    // Four matrices each for self- and, but in LVSM, cross-attention, two for the feed-forward network, in f32. The largest
+    // valid sizes do not overflow.
+    let in_attention = if config.has_latents() { 4 } else { 8 };
+    4 * blocks * (in_attention * dim * dim + 2 * dim * hidden)
 }
 
 #[cfg(test)]

@@ -58,6 +58,10 @@ impl Config {
         if !(low > 0.0 && low <= high && high <= 1.0) {
             return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
         }
+        if self.model.has_latents() && low < 1.0 {
+            let fix = "the decoder of model.architecture = \"lvsm-ed\" reads all latents: write [1.0, 1.0]";
+            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), fix));
+        }
         if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
             return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
         }
@@ -99,7 +103,7 @@ impl Config {
 
     fn validate_token_counts(&self) -> Result<(), TrainError> {
         let views = &self.data.views;
-        let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
+        let tokens_per_view = self.model.num_patches(1, self.data.height, self.data.width)?;
         let most_tokens = views.max_context.saturating_mul(tokens_per_view);
         if most_tokens > MAX_TOKENS {
             let fix = format!("{most_tokens} tokens exceed {MAX_TOKENS}: write fewer or smaller views");

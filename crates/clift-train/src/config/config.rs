@@ -8,6 +8,7 @@ use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCou
 use serde::{Deserialize, Serialize};
 
 use crate::error::{TrainError, bad};
+use crate::events::Stage;
 
 /// Most tokens of a scene: ids are stored in 16 bits.
 pub const MAX_TOKENS: usize = 1 << 16;
@@ -46,6 +47,7 @@ pub struct Config {
     #[serde(default)]
     pub clusters: ClustersConfig,
     /// Condenser, with the encoder frozen.
+    #[serde(default)]
     pub stage2: Stage2Config,
     /// When checkpoints are saved.
     #[serde(default)]
@@ -56,6 +58,21 @@ pub struct Config {
 }
 
 impl Config {
+    /// Returns the stages of a run in their order: a network without condenser has one.
+    pub fn stages(&self) -> &'static [Stage] {
+        if self.model.has_latents() { &[Stage::Stage1] } else { &[Stage::Stage1, Stage::Clusters, Stage::Stage2] }
+    }
+
+    /// Returns the stages of a run and its evaluation.
+    pub fn parts(&self) -> Vec<Stage> {
+        [self.stages(), &[Stage::Eval]].concat()
+    }
+
+    /// Returns the token counts of stored scenes in an evaluation: those of `eval`, or all latents.
+    pub fn eval_storage(&self) -> Vec<TokenCount> {
+        if self.model.has_latents() { vec![TokenCount::Share(1.0)] } else { self.eval.storage.clone() }
+    }
+
     /// Returns the settings of an evaluation, without LPIPS and external methods.
     pub(crate) fn sweep(&self, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
         let Self { seed, eval, clusters, model, device, .. } = self;

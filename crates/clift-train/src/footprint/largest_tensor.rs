@@ -107,6 +107,7 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
     let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
     let mut all = of(Part::Encoder, &scene);
     let counts = match part {
+        _ if config.model.has_latents() => Vec::new(),
         Stage::Stage1 => Vec::new(),
         Stage::Stage2 | Stage::Clusters => cluster_counts(config, scene.num_tokens)?,
         // An evaluation index may have other numbers of contexts.
@@ -115,10 +116,12 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         }
     };
     let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
-    if matches!(part, Stage::Clusters | Stage::Eval) {
+    if config.model.has_latents() {
+        all.extend(of(Part::Renderer, &scene));
+    } else if matches!(part, Stage::Clusters | Stage::Eval) {
         all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
     }
-    if matches!(part, Stage::Stage2 | Stage::Eval) {
+    if matches!(part, Stage::Stage2 | Stage::Eval) && !config.model.has_latents() {
         all.extend(of(Part::Condenser, &scene_with_stored_tokens(scene, most)));
         all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }
@@ -144,7 +147,6 @@ mod tests {
     use clift_model::{MAX_SCORES, TokenCount};
 
     use super::*;
-    use crate::footprint::scene_sizes::PARTS;
 
     /// The paper's network on six contexts of 256 x 256 and six targets, N = 6,144, T Q = 6,144.
     fn paper() -> Config {
@@ -198,7 +200,7 @@ mod tests {
     fn refusal_names_the_micro_batch_that_fits() {
         let config = paper();
         let limit = (1 << 31) - 4;
-        let message = check_tensor_limit(&config, limit, &PARTS).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, limit, &config.parts()).unwrap_err().to_string();
         // 64 scenes x 6 views at once; of 9 scenes it is 2.04e9 bytes, so 8 parts fit.
         let bytes = 64_u64 * 6 * 6143 * 2 * 768 * 4;
         let expected = format!(
@@ -224,6 +226,6 @@ mod tests {
         assert!(message.ends_with("write 5 with stage1.accumulate = 64, or choose smaller images"), "{message}");
         let message = check_tensor_limit(&config, 1000, &[Stage::Eval]).unwrap_err().to_string();
         assert!(message.starts_with("`data.width, data.height` = 256, 256:"), "{message}");
-        check_tensors(&config, &Device::flex(), &PARTS).expect("memory alone is a CPU's limit");
+        check_tensors(&config, &Device::flex(), &config.parts()).expect("memory alone is a CPU's limit");
     }
 }

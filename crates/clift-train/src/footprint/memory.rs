@@ -7,7 +7,7 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::footprint::scene_sizes::{
-    PARTS, VIEWS_PER_PASS, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips, num_tokens,
+    VIEWS_PER_PASS, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips, num_patches, num_tokens,
 };
 
 /// Memory of a process besides its tensors: code, threads and buffers (docs/guide/training.md).
@@ -34,7 +34,7 @@ pub fn peak_bytes(config: &Config, part: Stage) -> Result<u64, TrainError> {
 pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<String>, TrainError> {
     let Some(available) = available else { return Ok(None) };
     let mut largest = None;
-    for part in PARTS {
+    for part in config.parts() {
         let bytes = peak_bytes(config, part)?;
         if bytes > available && largest.is_none_or(|(_, most)| bytes >= most) {
             largest = Some((part, bytes));
@@ -103,7 +103,7 @@ fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
         num_tokens: most,
         num_clusters: cluster_counts(config, most)?.last().copied(),
         num_targets: 0,
-        num_patches: num_tokens(config, 1)?,
+        num_patches: num_patches(config, 1)?,
         num_image_values: image_values(config),
         metric_working: 0.0,
         metric_parameters: 0.0,
@@ -114,18 +114,22 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let eval = &config.eval;
     let parameters = Parameters::of(&config.model);
     let all = num_tokens(config, eval.num_context)?;
-    let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
+    let stored = config.eval_storage().iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
+    let has_latents = config.model.has_latents();
+    // LVSM encodes its latents beside the patches, and has no second stage.
+    let encoded = if has_latents { all + num_patches(config, eval.num_context)? } else { all };
+    let second_renderer = if has_latents { 0 } else { parameters.renderer };
     let sweep = eval_sizes(config);
     let num_rendered: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {
         // Each stage has a renderer.
-        num_parameters: parameters.total + parameters.renderer,
+        num_parameters: parameters.total + second_renderer,
         num_loaded: parameters.condenser + parameters.renderer,
-        num_tokens: all,
-        num_clusters: stored.iter().max().copied(),
+        num_tokens: encoded,
+        num_clusters: stored.iter().max().copied().filter(|_| !has_latents),
         num_targets: eval.num_targets.min(VIEWS_PER_PASS),
-        num_patches: num_tokens(config, 1)?,
+        num_patches: num_patches(config, 1)?,
         // Images of every count and method are kept until the metrics of the scene are computed.
         num_image_values: eval.num_targets * (num_rendered + 3) * config.data.width * config.data.height * 3,
         // Features of the images, their unit vectors, and input and output of a layer; or the file of weights while it is

@@ -7,8 +7,6 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
 
-/// The parts of a run, in the order they run.
-pub const PARTS: [Stage; 4] = [Stage::Stage1, Stage::Clusters, Stage::Stage2, Stage::Eval];
 /// Target views that an evaluation renders at once.
 pub const VIEWS_PER_PASS: usize = 8;
 /// Number of token shares over which averages are taken.
@@ -75,6 +73,9 @@ pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainE
 
 /// Returns the settings of an evaluation: the methods of the config, or those for which a run has weights.
 pub fn eval_sizes(config: &Config) -> Sweep {
+    if config.model.has_latents() {
+        return config.sweep(config.eval_storage(), vec![Method::LvsmEd]);
+    }
     let methods = [Method::Random, Method::Kmeans, Method::Clift];
     let mut variants = config.eval.variants.clone();
     // The condenser of tiles belongs to another run.
@@ -90,6 +91,11 @@ pub fn measures_lpips(config: &Config) -> bool {
 /// Returns the number of encoder tokens of a scene.
 pub fn num_tokens(config: &Config, num_context: usize) -> Result<usize, TrainError> {
     Ok(config.model.num_tokens(num_context, config.data.height, config.data.width)?)
+}
+
+/// Returns the number of patches of some views.
+pub fn num_patches(config: &Config, num_views: usize) -> Result<usize, TrainError> {
+    Ok(config.model.num_patches(num_views, config.data.height, config.data.width)?)
 }
 
 /// Returns the numbers of clusters that stage 2 samples from, ascending.
@@ -112,7 +118,8 @@ pub fn scene_with_all_tokens(
     num_context: usize,
     num_targets: usize,
 ) -> Result<SceneSizes, TrainError> {
-    Ok(SceneSizes::new(num_tokens(config, num_context)?, num_targets, num_tokens(config, 1)?))
+    let size = [config.data.height, config.data.width];
+    Ok(SceneSizes::of(&config.model, num_context, num_targets, size)?)
 }
 
 /// Returns the sizes of a scene whose target views are rendered from `count` stored tokens.

@@ -44,7 +44,7 @@ pub struct Exported {
 /// the keys of published checkpoints, `transformer.` before each, and the token codec beside them.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] if `out` exists or a network with camera-relative attention has no published keys,
+/// [`TrainError::BadConfig`] if `out` exists, or if a network with camera-relative attention or of LVSM has no published keys,
 /// [`TrainError::BadFile`] if the weight file does not fit the config, and those of reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
     match format {
@@ -73,6 +73,11 @@ fn export_published(
         require_absent(&codecs[1])?;
     }
     config.model.validate()?;
+    if config.model.has_latents() {
+        let fix =
+            "the formats are those of CLiFT's checkpoints, which have no names for this network: write --format f16";
+        return Err(bad("model.architecture", format!("\"{}\"", config.model.architecture), fix));
+    }
     if config.model.camera_encoding != CameraEncoding::Plucker {
         let fix = "published networks have plain attention; only runs with \"plucker\" are exported";
         return Err(bad("model.camera_encoding", config.model.camera_encoding, fix));

@@ -1,15 +1,16 @@
-//! Evaluation of a model without a run: an imported model or a weight file.
+//! The models of an evaluation: of other runs beside a run, and a model without a run, imported or a weight file.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use burn::tensor::Device;
 use clift_data::{ClipReader, open_dataset};
 use clift_eval::{EvalFrames, EvalModels, Method, Summary};
-use clift_model::{ModelPath, TokenCodec, TrainedModel};
+use clift_model::{ModelError, ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
-use crate::events::{Event, Sink};
+use crate::events::{Event, Sink, Stage};
 use crate::run::validation::{EvalRequest, Validation};
 
 /// Evaluates a model with the data and settings of `config`.
@@ -63,4 +64,46 @@ pub fn evaluate_model(
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     let validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
     validation.evaluate(&models, request, stop, sink)
+}
+
+/// Opens the stage-2 model of the run of `config`, which must be trained on the encoder of `stage1`.
+pub(crate) fn open_stage2(config: &Config, stage1: &TrainedModel) -> Result<TrainedModel, TrainError> {
+    let found = weights(config, Stage::Stage2, "the weights of stage 2")?;
+    let model = TrainedModel::open(&found, &config.model, &stage1.device)?;
+    let path = found.weights;
+    if !model.has_condenser {
+        let reason = "the file has no condenser".into();
+        return Err(ModelError::Weights { action: "reading", reason, path }.into());
+    }
+    if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
+}
+
+/// Opens the model of a run of LVSM, for an evaluation of the run of `evaluated` with those of `others`.
+pub(crate) fn open_lvsm(
+    evaluated: &Config,
+    config: &Config,
+    others: &[TrainedModel],
+    device: &Device,
+) -> Result<TrainedModel, TrainError> {
+    let [ours, theirs] = [evaluated, config].map(|config| config.data.clip_options());
+    let refuse = |fix: &str| Err(bad("--with", config.run_dir.display(), fix));
+    if (theirs.width, theirs.height, theirs.pose_rotation, theirs.pose_scale)
+        != (ours.width, ours.height, ours.pose_rotation, ours.pose_scale)
+    {
+        return refuse("it was trained on images of another size or on other poses: choose a run with the same [data]");
+    }
+    if others.iter().any(|other| other.config.num_latents == config.model.num_latents) {
+        return refuse("another run of LVSM has as many latents: choose runs with distinct model.num_latents");
+    }
+    let found = weights(config, Stage::Stage1, "the weights of stage 1")?;
+    Ok(TrainedModel::open(&found, &config.model, device)?)
+}
+
+/// Finds the weights of a stage, `what` in messages.
+fn weights(config: &Config, stage: Stage, what: &'static str) -> Result<ModelPath, TrainError> {
+    let path = config.run_dir.join(stage.name()).join("model.safetensors");
+    if !path.exists() {
+        return Err(TrainError::Missing { stage: "evaluation", what, first: "clift train", path });
+    }
+    Ok(ModelPath { dir: config.run_dir.clone(), weights: path })
 }

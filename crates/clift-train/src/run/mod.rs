@@ -12,7 +12,7 @@
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
 //! - `init_from`: initial weights of a stage
-//! - `evaluate_model`: evaluate a model without a run
+//! - `evaluate_model`: evaluate a model without a run; models of other runs
 //! - `run`: a run: open, train, evaluate
 
 pub(crate) mod batch_wait;

@@ -12,8 +12,7 @@ use clift_data::{
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
-    Clift, ModelError, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights,
-    weights_hash,
+    Clift, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
 };
 
 use crate::cluster_cache::builder::ClusterBuilder;
@@ -23,8 +22,8 @@ use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
-use crate::footprint::scene_sizes::PARTS;
 use crate::run::eval_folder::{EvalFolder, SUMMARY};
+use crate::run::evaluate_model::{open_lvsm, open_stage2};
 use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, compare_settings, free_name, require_run, write_config};
@@ -77,7 +76,11 @@ impl Run {
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
-        largest_tensor::check_tensors(&config, &device, &PARTS)?;
+        if let Some(only) = options.only.filter(|only| !config.stages().contains(only)) {
+            let fix = "a network of model.architecture = \"lvsm-ed\" has one stage: write stage1, or leave --only out";
+            return Err(bad("--only", only.name(), fix));
+        }
+        largest_tensor::check_tensors(&config, &device, &config.parts())?;
         // Missing weights are reported now, not after days of training.
         config.loss.weights()?;
         if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
@@ -146,8 +149,10 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Option<Summary>, TrainError> {
-        let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
-        let is_trained = [Stage::Stage1, Stage::Stage2].into_iter().all(|stage| self.weights(stage).exists());
+        let stages = self.config.stages();
+        let wanted = |stage: Stage| stages.contains(&stage) && only.is_none_or(|only| only == stage);
+        let trained = [Stage::Stage1, Stage::Stage2].into_iter().filter(|stage| stages.contains(stage));
+        let is_trained = trained.into_iter().all(|stage| self.weights(stage).exists());
         let summary = self.folder("eval").join(SUMMARY);
         if only.is_none() && is_trained && summary.exists() {
             let run = self.config.run_dir.display();
@@ -195,8 +200,8 @@ impl Run {
         validation.evaluate(&self.models(sink)?, &request, stop, sink).map(Some)
     }
 
-    /// Evaluates the run. `beside` is another run with the same stage 1 whose stage 2 was trained on other groups of tokens,
-    /// evaluated on the same views.
+    /// Evaluates the run. `beside` are other runs, evaluated on the same views: one with the same stage 1 whose stage 2 was
+    /// trained on other groups of tokens, and runs of LVSM with distinct numbers of latents.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] if stage 2 was trained on another
@@ -204,7 +209,7 @@ impl Run {
     pub fn evaluate(
         &self,
         request: &EvalRequest,
-        beside: Option<&Config>,
+        beside: &[Config],
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
@@ -212,13 +217,17 @@ impl Run {
         let is_inside = self.lock.is_none() && request.folder.is_in(run_dir);
         let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::Run, sink)).transpose()?;
         let mut models = self.models(sink)?;
-        if let Some(other) = beside {
+        for other in beside {
+            if other.model.has_latents() {
+                models.lvsm.push(open_lvsm(&self.config, other, &models.lvsm, &self.device)?);
+                continue;
+            }
             if other.clusters.grouping == self.config.clusters.grouping {
                 let fix = "its stage 2 was trained on the same groups of tokens: choose a run with another \
                            clusters.grouping";
                 return Err(bad("--with", other.run_dir.display(), fix));
             }
-            models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
+            models.set_stage2(other.clusters.grouping, open_stage2(other, &models.stage1)?);
         }
         self.validation(request.split, sink)?.evaluate(&models, request, stop, sink)
     }
@@ -229,29 +238,13 @@ impl Run {
         let path = ModelPath { dir: self.config.run_dir.clone(), weights };
         let mut models = EvalModels::new(TrainedModel::open(&path, &self.config.model, &self.device)?);
         if self.weights(Stage::Stage2).exists() {
-            let stage2 = self.open_stage2(&self.config, &models.stage1)?;
+            let stage2 = open_stage2(&self.config, &models.stage1)?;
             models.codec = TokenCodec::beside(&self.weights(Stage::Stage2), &stage2)?.map(Arc::new);
             models.set_stage2(self.config.clusters.grouping, stage2);
-        } else {
+        } else if self.config.stages().contains(&Stage::Stage2) {
             sink.event(&Event::Message("stage 2 has not run: evaluating only the weights of stage 1".into()));
         }
         Ok(models)
-    }
-
-    /// Opens the stage-2 model of the run of `config`, which must be trained on the encoder of `stage1`.
-    fn open_stage2(&self, config: &Config, stage1: &TrainedModel) -> Result<TrainedModel, TrainError> {
-        let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
-        if !path.exists() {
-            let what = "the weights of stage 2";
-            return Err(TrainError::Missing { stage: "evaluation", what, first: "clift train", path });
-        }
-        let found = ModelPath { dir: config.run_dir.clone(), weights: path.clone() };
-        let model = TrainedModel::open(&found, &config.model, &self.device)?;
-        if !model.has_condenser {
-            let reason = "the file has no condenser".into();
-            return Err(ModelError::Weights { action: "reading", reason, path }.into());
-        }
-        if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
     }
 
     /// Opens the evaluated views of a split.

@@ -93,7 +93,7 @@ impl<'a> Validation<'a> {
             models.set_stage2(clusters.grouping, model);
             (eval.validation_storage, stage2_method(clusters.grouping))
         } else {
-            (TokenCount::Share(1.0), Method::Kmeans)
+            (TokenCount::Share(1.0), if sizes.has_latents() { Method::LvsmEd } else { Method::Kmeans })
         };
         let all = &self.evaluator.sweep;
         let sweep = Sweep {

@@ -30,7 +30,7 @@ impl Stage1Batches {
             seed,
         )?;
         let clips = clips.with_flip(config.data.flip);
-        let tokens_per_view = config.model.num_tokens(1, config.data.height, config.data.width)?;
+        let tokens_per_view = config.model.num_patches(1, config.data.height, config.data.width)?;
         Ok(Self { clips, keep_tokens: config.stage1.keep_tokens, tokens_per_view, seed })
     }
 

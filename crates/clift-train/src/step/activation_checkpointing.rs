@@ -35,11 +35,12 @@ pub(crate) fn backward(
     let context_transforms = plain.encoder.transforms(&context.cameras);
     let target_transforms = plain.renderer.transforms(&targets);
     let encode = |block: &EncoderBlock, x: Tensor<3>| block.forward(x, context_transforms.as_ref());
-    let (encoder_inputs, lift) = block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), encode);
-    let lift = Tokens { values: lift, transforms: context_transforms.clone() };
+    let (encoder_inputs, encoded) = block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), encode);
+    let lift = Tokens { values: plain.encoder.to_tokens(encoded.clone()), transforms: context_transforms.clone() };
     let tokens = selection.apply(&plain.condenser, plain.normalize(lift.clone()))?;
-    let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
-        block.forward(x, tokens.project(block), target_transforms.as_ref())
+    let blocks: Vec<usize> = (0..plain.renderer.num_blocks()).collect();
+    let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&tokens, &targets), &blocks, |&block, x| {
+        plain.renderer.block(block, x, &tokens, target_transforms.as_ref())
     });
 
     // Backward, one block after the other.
@@ -51,29 +52,38 @@ pub(crate) fn backward(
     add(grads);
 
     let mut grad_tokens: Option<Tensor<3>> = None;
-    let target_transforms = model.renderer.transforms(&device_batch.targets);
-    for (block, input) in model.renderer.blocks().iter().zip(renderer_inputs).rev() {
-        let (x, block_tokens) = (leaf(input), leaf(tokens.values().clone()));
-        let key_value = tokens.with_values(block_tokens.clone()).project(block);
-        let output = block.forward(x.clone(), key_value, target_transforms.as_ref());
-        let mut grads = backward_from(output, grad_x);
-        grad_x = take_gradient(&x, &mut grads);
-        let grad = take_gradient(&block_tokens, &mut grads);
-        grad_tokens = Some(match grad_tokens {
+    // A renderer reads the tokens in every block, or before the first.
+    let mut add_grad_tokens = |tokens: &Tensor<3>, grads: &mut Gradients| {
+        let Some(grad) = tokens.grad_remove(grads) else { return };
+        grad_tokens = Some(match grad_tokens.take() {
             Some(sum) => sum + grad,
             None => grad,
         });
+    };
+    let target_transforms = model.renderer.transforms(&device_batch.targets);
+    for (block, input) in blocks.into_iter().zip(renderer_inputs).rev() {
+        let (x, block_tokens) = (leaf(input), leaf(tokens.values().clone()));
+        let tokens = tokens.with_values(block_tokens.clone());
+        let output = model.renderer.block(block, x.clone(), &tokens, target_transforms.as_ref());
+        let mut grads = backward_from(output, grad_x);
+        grad_x = take_gradient(&x, &mut grads);
+        add_grad_tokens(&block_tokens, &mut grads);
         add(grads);
     }
-    add(backward_from(model.renderer.embed(&device_batch.targets), grad_x));
+    let embedded_tokens = leaf(tokens.values().clone());
+    let embedded = model.renderer.embed(&tokens.with_values(embedded_tokens.clone()), &device_batch.targets);
+    let mut grads = backward_from(embedded, grad_x);
+    add_grad_tokens(&embedded_tokens, &mut grads);
+    add(grads);
     let Some(grad_tokens) = grad_tokens else {
         return Ok(parts); // a renderer without blocks reads no token
     };
 
-    let lift = lift.with_values(leaf(lift.values.clone()));
+    let encoded = leaf(encoded);
+    let lift = lift.with_values(model.encoder.to_tokens(encoded.clone()));
     let output = selection.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
     let mut grads = backward_from(output, grad_tokens);
-    let mut grad_x = take_gradient(&lift.values, &mut grads);
+    let mut grad_x = take_gradient(&encoded, &mut grads);
     add(grads);
     if !trains(&model.encoder) {
         return Ok(parts);
@@ -133,7 +143,7 @@ fn trains<M: Module>(module: &M) -> bool {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
+    use clift_model::{Architecture, CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
 
     use super::*;
     use crate::events::Stage;
@@ -148,7 +158,7 @@ mod tests {
 
     /// Returns the gradient of every parameter by the plain and by the checkpointed backward.
     fn both(
-        (variant, camera_encoding): (CliftVariant, CameraEncoding),
+        config: &ModelConfig,
         stage: Stage,
         batch: &StageBatch,
         loss: &Loss,
@@ -167,18 +177,7 @@ mod tests {
                 self.pairs.extend(a.zip(b));
             }
         }
-        let config = ModelConfig {
-            variant,
-            camera_encoding,
-            condenser: CondenserConfig::of(variant),
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 24,
-            num_encoder_blocks: 2,
-            num_renderer_blocks: 2,
-            ..ModelConfig::default()
-        };
-        let model = freeze(stage, seeded_model(&config, 3, device));
+        let model = freeze(stage, seeded_model(config, 3, device));
         let device_batch = DeviceBatch::upload(&batch.clips, &device.clone().autodiff()).expect("valid");
         let plain_loss = render_loss(&model, &device_batch, &batch.tokens, loss).expect("valid").total;
         let plain = GradientsParams::from_grads(plain_loss.clone().mul_scalar(0.5).backward(), &model);
@@ -205,15 +204,30 @@ mod tests {
         let few = StageBatch { tokens: subsets(2), ..all.clone() };
         let many = StageBatch { tokens: subsets(7), ..all.clone() };
         let cases = [(Stage::Stage1, all), (Stage::Stage1, few), (Stage::Stage1, many), (Stage::Stage2, stored)];
-        let plain = CliftVariant::ALL.map(|variant| (variant, CameraEncoding::Plucker));
-        let relative = [CameraEncoding::Gta, CameraEncoding::Prope].map(|encoding| (CliftVariant::Paper, encoding));
-        for network @ (variant, _) in plain.into_iter().chain(relative) {
-            for (stage, batch) in &cases {
+        let small = ModelConfig {
+            dim: 16,
+            num_heads: 2,
+            feed_forward_dim: 24,
+            num_encoder_blocks: 2,
+            num_renderer_blocks: 2,
+            ..ModelConfig::default()
+        };
+        let of = |variant| ModelConfig { variant, condenser: CondenserConfig::of(variant), ..small.clone() };
+        let relative = [CameraEncoding::Gta, CameraEncoding::Prope];
+        let relative = relative.map(|camera_encoding| ModelConfig { camera_encoding, ..small.clone() });
+        let lvsm = [CliftVariant::Paper, CliftVariant::ReleasedRe10k].map(|variant| ModelConfig {
+            architecture: Architecture::LvsmEd,
+            num_latents: 12,
+            condenser: CondenserConfig::NONE,
+            ..of(variant)
+        });
+        for network in CliftVariant::ALL.map(of).iter().chain(&relative).chain(&lvsm) {
+            for (stage, batch) in cases.iter().filter(|(stage, _)| *stage == Stage::Stage1 || !network.has_latents()) {
                 let pairs = both(network, *stage, batch, &Loss::default(), &Device::flex());
                 let largest = |values: &[f32]| values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
                 let scale = pairs.iter().map(|(plain, _)| largest(plain)).fold(0.0, f32::max);
                 for (plain, again) in pairs {
-                    if !variant.has_norms() {
+                    if !network.variant.has_norms() && !network.has_latents() {
                         assert_eq!(plain, again, "bit for bit");
                     }
                     // Burn adds the gradients of a composed norm in the order of the whole graph. The floor covers

@@ -87,7 +87,7 @@ impl OpenScene {
             patch: scene.model.patch_size,
             stored: scene.num_tokens(),
             storage_counts: &origin.storage_counts,
-            num_patches: scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?,
+            num_patches: scene.model.num_patches(scene.context.len(), scene.height, scene.width)?,
             bytes: origin.file_bytes,
             tokens: format!("{}, {}", scene.kind, origin.coding),
             token_ids: &scene.token_ids,
@@ -136,7 +136,7 @@ fn sizes(scene: &Scene, device: DeviceName) -> Vec<[usize; 2]> {
         .filter(|size| *size == own || (is_similar(*size, own) && size.iter().all(|side| *side <= MAX_SIDE_PX)))
         .filter(|size| {
             let num_patches = size[0] / patch * (size[1] / patch);
-            let needed = render_bytes(&scene.model, scene.num_tokens(), num_patches);
+            let needed = render_bytes(&scene.model, scene.num_tokens(), 1, num_patches);
             *size == own || available_bytes(device).is_none_or(|available| needed <= available / 2)
         })
         .collect();

@@ -112,11 +112,11 @@ impl RunScenes {
         check_position("scene", request.scene, self.items.len())?;
         let EvaluationItem { scene: index, views } = &self.items[request.scene];
         let clift_data::ClipOptions { width, height, .. } = self.reader.options;
-        let num_patches = self.model.config.num_tokens(views.context.len(), height, width)?;
-        let counts = self.storage_counts(num_patches);
+        let num_tokens = self.model.config.num_tokens(views.context.len(), height, width)?;
+        let counts = self.storage_counts(num_tokens);
         // Without a request, the count nearest to that of `clift encode`, a quarter.
-        let wanted = request.stored.unwrap_or(num_patches / 4);
-        let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_patches);
+        let wanted = request.stored.unwrap_or(num_tokens / 4);
+        let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
         let options = EncodeOptions {
             context: Some(views.context.clone()),
             storage: TokenCount::Count(stored),

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use clift_data::{ClipReader, DataError, SceneSource, Split, plural};
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
 use clift_model::{
-    CodedLoss, ModelError, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TrainedModel, check_output_path,
+    CodedLoss, ModelError, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TokenKind, TrainedModel,
+    check_output_path,
 };
 use serde::Serialize;
 
@@ -112,6 +113,9 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     }
     let model_args = ModelArgs::find(&args.model, args.data.as_deref(), &args.overrides)?;
     let ModelArgs { given, path, config, .. } = &model_args;
+    if config.model.has_latents() && args.save_clusters.is_some() {
+        usage_bail!("--save-clusters: the latents of {} are not clustered; leave the option out", given.display());
+    }
     let source = model_args.open_data(args.split)?.source;
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
     let context = frame_positions(&args.context, || source.frame_names(scene))?;
@@ -119,7 +123,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then_some(context),
         num_context: model_args.num_context(config.data.views.max_context, reader.source.num_frames(scene)?),
-        storage: TokenCount::Share(0.25),
+        storage: TokenCount::Share(if config.model.has_latents() { 1.0 } else { 0.25 }),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
@@ -192,6 +196,10 @@ enum Coding {
 
 impl Coding {
     fn new(args: &EncodeArgs, weights: &Path, model: &TrainedModel) -> anyhow::Result<Self> {
+        let is_coded = matches!(args.tokens, Some(TokenCoding::Coded(_)));
+        if model.config.has_latents() && (is_coded || args.quality.is_some() || args.size_kb.is_some()) {
+            usage_bail!("the latents of lvsm-ed have no codec; store them with --tokens f32, f16 or int8");
+        }
         let found = || TokenCodec::beside(weights, model);
         let codec = || found()?.ok_or_else(|| ModelError::NoCodec { path: TokenCodec::path_of(weights) });
         Ok(match (args.quality, args.size_kb, args.tokens) {
@@ -211,7 +219,7 @@ impl Coding {
         let Self::Bytes(codec, bytes) = self else { return args.storage.unwrap_or(options.storage) };
         let views = options.context.as_ref().map_or(options.num_context, Vec::len);
         let (height, width) = (reader.options.height, reader.options.width);
-        let num_patches = codec.model.num_tokens(views, height, width).unwrap_or(1);
+        let num_patches = codec.model.num_patches(views, height, width).unwrap_or(1);
         let tokens = *bytes as f64 - coded_overhead(views, options.model_path.len()) as f64;
         let best = TokenCount::Share(codec.rates.share_for_bytes(num_patches, tokens.max(1.0)));
         args.storage.unwrap_or(best)
@@ -258,9 +266,12 @@ fn describe(encoded: &EncodedScene, stored: &str, path: &Path) -> String {
     let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = encoded;
     let num_tokens = scene.num_tokens();
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let clusters = match scene.kind {
+        TokenKind::Latents => String::new(),
+        _ => format!("\ntokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}"),
+    };
     format!(
-        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {stored}), {}\nscene {}, {} of {} x {}: frames {frames}\n\
-         tokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}",
+        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {stored}), {}\nscene {}, {} of {} x {}: frames {frames}{clusters}",
         path.display(),
         scene.kind,
         file_size(std::fs::metadata(path).map_or(0, |file| file.len())),

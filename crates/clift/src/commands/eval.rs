@@ -25,12 +25,12 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let config = eval_config(args, folder)?;
     let results = if args.split == Split::Train { "eval-train" } else { "eval" };
     let out: PathBuf = args.out.clone().unwrap_or_else(|| folder.join(results));
-    let with = args.with.as_ref().map(|run| -> anyhow::Result<Config> {
+    let with = args.with.iter().map(|run| -> anyhow::Result<Config> {
         let (mut config, _) = read_config(&run.join("config.toml"), &[], |_| Ok(()))?;
         config.run_dir.clone_from(run);
         Ok(config)
     });
-    let with = with.transpose()?;
+    let with = with.collect::<anyhow::Result<Vec<Config>>>()?;
     if model.is_some() && config.eval.index.is_none() {
         print_warning(
             "without --index, contexts and targets are spread evenly over each scene; published figures use an \
@@ -42,7 +42,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let folder = EvalFolder::open(&out, args.force, sink.as_mut())?;
     let request = EvalRequest { split: args.split, external: &external, folder: &folder };
     let summary = match &model {
-        None => Run::reopen(config)?.evaluate(&request, with.as_ref(), &stop, sink.as_mut())?,
+        None => Run::reopen(config)?.evaluate(&request, &with, &stop, sink.as_mut())?,
         Some(model) => {
             let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
             evaluate_model(config, model, stage1.as_ref(), &request, &stop, sink.as_mut())?
@@ -125,9 +125,12 @@ pub struct EvalArgs {
     /// K-means, with and without condenser; needs --with. budget: half of the tokens stored, decreasing rendered counts.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Experiment>,
-    /// Add a run with the same stage 1 and another clusters.grouping
+    /// Add a run of LVSM, or one of this stage 1 and another clusters.grouping
+    ///
+    /// Runs with `model.architecture = "lvsm-ed"` are trained on their own and have distinct numbers of latents. The
+    /// option is repeatable: `clift eval RUN --preset main --with runs/lvsm-64 --with runs/lvsm-16` is the paper's main figure.
     #[arg(long, value_name = "RUN", conflicts_with = "checkpoint")]
-    pub with: Option<PathBuf>,
+    pub with: Vec<PathBuf>,
     /// Stored token counts, as numbers or shares, e.g. 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub storage: Vec<TokenCount>,

@@ -59,8 +59,9 @@ fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
         let counts = given(PAPER_TOKENS.map(TokenCount::Count).into());
         return Ok(Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts });
     };
-    let (Config { model, data, eval, .. }, _) = read_config(path, &args.set, check_plan)?;
-    let counts = given(eval.storage.into_iter().rev().collect());
+    let (config, _) = read_config(path, &args.set, check_plan)?;
+    let counts = given(config.eval_storage().into_iter().rev().collect());
+    let Config { model, data, eval, .. } = config;
     Ok(Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts })
 }
 
@@ -83,7 +84,7 @@ fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
     // The paper counts rendering only.
     if convention != FlopConvention::Paper {
         rows.push(row("encode", num_tokens, model.encode_macs(num_context, height, width)?));
-        for count in counts {
+        for count in counts.iter().filter(|_| !model.has_latents()) {
             let tokens = count.of(num_tokens)?;
             rows.push(row("condense", tokens, model.condense_macs(num_tokens, tokens)));
         }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clift_bench::{PartPlan, Plan, check_plan, missing_weights, plan};
 use clift_model::max_tensor_bytes;
-use clift_train::{Config, LargestTensor, PARTS, largest_tensor, memory_warning};
+use clift_train::{Config, LargestTensor, largest_tensor, memory_warning};
 
 use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 use crate::output::stdout::{print_result, print_warning};
@@ -30,7 +30,7 @@ fn largest_tensors(config: &Config) -> anyhow::Result<String> {
     // A plan for a device that this machine does not have shows no limit.
     let limit = config.device.open().ok().and_then(|device| max_tensor_bytes(&device));
     let mut rows = Vec::new();
-    for part in PARTS {
+    for part in config.parts() {
         let LargestTensor { what, bytes: size, .. } = largest_tensor(config, part)?;
         let verdict = match limit {
             Some(limit) if size > limit => "TOO LARGE: `clift train` refuses this config",

@@ -20,11 +20,11 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let stop = interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();
-    let run_dir = config.run_dir.clone();
+    let (run_dir, has_latents) = (config.run_dir.clone(), config.model.has_latents());
     let run = Run::open(config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir))
+    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, !has_latents))
 }
 
 #[derive(Debug, clap::Args)]

@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 
 use clift_data::{ClipReader, Split};
 use clift_eval::{EncodeOptions, EvalFrames, evaluation_items};
-use clift_model::{DeviceName, Scene, load_renderer};
+use clift_model::{DeviceName, ModelConfig, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ServerOptions, ViewServer};
 
 use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
@@ -73,6 +73,7 @@ fn open_file(file: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
         usage_bail!("--set changes the config of a run; {} is a scene file", file.display());
     }
     let (scene, coding) = Scene::read_for(file, args.model.as_deref())?;
+    require_places(&scene.model, file)?;
     let file_bytes = std::fs::metadata(file).map_or(0, |file| file.len());
     let weights = scene_weights(&scene, file, args.model.as_deref())?;
     let device = args.overrides.device.unwrap_or_default();
@@ -97,6 +98,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let shortest = lengths.collect::<Result<Vec<_>, _>>()?.into_iter().min().unwrap_or_default();
     let num_context = model_args.num_context(model_args.config.eval.num_context, shortest);
     let ModelArgs { given, mut config, folder, .. } = model_args;
+    require_places(&config.model, &given)?;
     config.eval.num_context = num_context;
     let frames = EvalFrames::new(&opened, args.split, config.data.hold_out, folder.is_none());
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
@@ -131,6 +133,17 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
         render_args: device_args(args.overrides.device),
     };
     Ok((SceneSet::Run(Box::new(scenes)), config.device))
+}
+
+/// Refuses latents, which the page could neither show on the context views nor select.
+fn require_places(model: &ModelConfig, path: &Path) -> anyhow::Result<()> {
+    if model.has_latents() {
+        usage_bail!(
+            "{}: the viewer shows where tokens lie, and latents of lvsm-ed lie nowhere; use `clift render`",
+            path.display()
+        );
+    }
+    Ok(())
 }
 
 fn device_args(device: Option<DeviceName>) -> Vec<String> {

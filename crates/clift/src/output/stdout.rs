@@ -15,11 +15,12 @@ pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
 
-/// Writes the result of a run, the path of its report, which has the whole table, and the command that shows its scenes:
-/// seven lines for a small terminal.
-pub fn print_run(summary: &Summary, run: &Path) -> anyhow::Result<()> {
+/// Writes the result of a run, the path of its report, which has the whole table, and the command that shows its scenes, if
+/// the viewer can: seven lines for a small terminal.
+pub fn print_run(summary: &Summary, run: &Path, has_view: bool) -> anyhow::Result<()> {
     let report = run.join("eval").join("report.html");
-    print_result(&format!("{}\nreport: {}\nscenes: clift view {}", summary.headline(), report.display(), run.display()))
+    let view = if has_view { format!("\nscenes: clift view {}", run.display()) } else { String::new() };
+    print_result(&format!("{}\nreport: {}{view}", summary.headline(), report.display()))
 }
 
 /// Writes the table of an evaluation and the paths of its report and files.

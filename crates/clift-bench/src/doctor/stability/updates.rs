@@ -1,7 +1,7 @@
 //! Whole updates, loss and gradients, on extreme views.
 
 use clift_data::{Clip, ClipViews, MAX_COORDINATE};
-use clift_model::{CameraEncoding, ModelConfig};
+use clift_model::{Architecture, CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
 use clift_train::{ClipShape, Stage, StageBatch, TrainError, freeze, seeded_batch, seeded_model};
 
 use crate::cases::step::update_error;
@@ -50,6 +50,12 @@ pub(crate) const CASES: &[StabilityCase] = &[
         "focal lengths in both",
         |devices| relative_views(devices, CameraEncoding::Prope, |clip| field_of_view(clip, 5.0)),
     ),
+    gradient_case("LVSM's encoder-decoder", "latents among patches, norms of queries and keys", |devices| {
+        lvsm_views(devices, CliftVariant::Paper)
+    }),
+    gradient_case("LVSM's encoder-decoder of stock blocks", "latents among patches", |devices| {
+        lvsm_views(devices, CliftVariant::ReleasedRe10k)
+    }),
     gradient_case("field of view of 5 degrees", "rays that are nearly parallel", |devices| {
         changed_views(devices, 4, |clip| field_of_view(clip, 5.0))
     }),
@@ -121,12 +127,29 @@ fn relative_views(
     let mut batch = seeded_batch(shape(devices, 4), 1, num_tokens(devices, 4), None, 0)?;
     batch.clips.iter_mut().for_each(change);
     let config = ModelConfig { camera_encoding, num_heads: devices.size.pick(2, 4), ..network(devices) };
-    let model = freeze(Stage::Stage1, seeded_model(&config, 0, &devices.device));
-    Ok(Outcome::Error(update_error(&model, &batch, &devices.device, &devices.reference, NOISE_SHARE)?))
+    network_error(devices, &config, Stage::Stage1, &batch)
+}
+
+/// Returns the error of an update of LVSM.
+fn lvsm_views(devices: &CaseDevices, variant: CliftVariant) -> Result<Outcome, TrainError> {
+    let batch = seeded_batch(shape(devices, 4), 1, num_tokens(devices, 4), None, 0)?;
+    let (num_latents, condenser) = (devices.size.pick(5, 64), CondenserConfig::NONE);
+    let architecture = Architecture::LvsmEd;
+    let config = ModelConfig { architecture, variant, num_latents, condenser, ..network(devices) };
+    network_error(devices, &config, Stage::Stage1, &batch)
 }
 
 pub(crate) fn stage_error(devices: &CaseDevices, stage: Stage, batch: &StageBatch) -> Result<Outcome, TrainError> {
-    let model = freeze(stage, seeded_model(&network(devices), 0, &devices.device));
+    network_error(devices, &network(devices), stage, batch)
+}
+
+fn network_error(
+    devices: &CaseDevices,
+    config: &ModelConfig,
+    stage: Stage,
+    batch: &StageBatch,
+) -> Result<Outcome, TrainError> {
+    let model = freeze(stage, seeded_model(config, 0, &devices.device));
     Ok(Outcome::Error(update_error(&model, batch, &devices.device, &devices.reference, NOISE_SHARE)?))
 }
 

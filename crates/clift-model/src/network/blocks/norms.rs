@@ -17,7 +17,7 @@ pub struct LiftNorm {
 impl LiftNorm {
     /// Makes the norm of the variant.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
-        Self { norm: config.variant.has_norms().then(|| init.layer_norm(config.dim)) }
+        Self { norm: config.has_token_norm().then(|| init.layer_norm(config.dim)) }
     }
 
     /// Whether the variant has a norm.
@@ -48,7 +48,7 @@ pub struct QkNorm {
 impl QkNorm {
     /// Makes the norms of an attention layer; `None` in variants without them.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Option<Self> {
-        config.variant.has_norms().then(|| {
+        config.has_query_key_norms().then(|| {
             let head_width = config.dim / config.num_heads;
             Self { query: init.rms_norm(head_width), key: init.rms_norm(head_width) }
         })

@@ -6,6 +6,8 @@ use safetensors::SafeTensors;
 
 use super::*;
 use crate::error::ModelError;
+use crate::network::architecture::CliftVariant;
+use crate::testing::small_lvsm;
 
 const DIM: usize = 8;
 
@@ -92,6 +94,35 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
         assert!(format != TokenFormat::F32 || back == scene(), "f32 is exact");
     }
     assert_eq!(std::fs::read_dir(folder.0.path()).expect("a folder").count(), 1, "no temporary file is left");
+}
+
+#[test]
+fn latents_are_stored_without_places() {
+    let folder = Folder::new();
+    let model = ModelConfig { dim: DIM, num_heads: 2, num_latents: 5, ..small_lvsm(CliftVariant::Paper) };
+    let latents = Scene { kind: TokenKind::Latents, model, token_ids: (0..5).collect(), ..scene() };
+    for format in TokenFormat::ALL {
+        latents.write(&folder.path(), format).expect("writes");
+        let bytes = std::fs::read(folder.path()).expect("reads");
+        let expected = 8 + 2048 + 136 + 164 * 2 + 5 * format.bytes_per_token(DIM);
+        assert_eq!((bytes.len(), latents.file_bytes(format)), (expected, expected as u64), "{format}");
+        let tokens = format.round(&latents.tokens, DIM).expect("in range");
+        assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..latents.clone() }, format.into()));
+    }
+    let bytes = std::fs::read(folder.path()).expect("reads");
+    let changed = |from: &str, to: &str| {
+        let at = bytes.windows(from.len()).position(|part| part == from.as_bytes()).expect("in the header");
+        [&bytes[..at], to.as_bytes(), &bytes[at + from.len()..]].concat()
+    };
+    folder.assert_refused(&changed(r#"\"dim\":8"#, r#"\"dim\":0"#), "`model.dim` = 0");
+    folder.assert_refused(
+        &changed(r#"\"num_latents\":5"#, r#"\"num_latents\":4"#),
+        "`token_scales` is F32 [5], expected F32 [4]",
+    );
+    let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
+    assert!(folder.write_error(&few, "few", TokenFormat::F32).contains("expected all 5 latents in order"));
+    let kind = Scene { kind: TokenKind::Clift, ..latents };
+    assert!(folder.write_error(&kind, "kind", TokenFormat::F32).contains("clift tokens of a network of lvsm-ed"));
 }
 
 #[test]

@@ -120,10 +120,10 @@ fn check_size(scene: &Scene, [width, height]: [usize; 2], selects: bool, device:
     if width.max(height) > MAX_SIDE_PX {
         usage_bail!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels per side");
     }
-    let num_patches = scene.model.num_tokens(1, height, width)?;
+    let num_patches = scene.model.num_patches(1, height, width)?;
     // With token selection every frame has its own tokens and is rendered alone.
     let num_frames = if selects { 1 } else { frames_per_call(num_patches) };
-    let needed = render_bytes(&scene.model, scene.num_tokens(), num_patches * num_frames);
+    let needed = render_bytes(&scene.model, scene.num_tokens(), num_frames, num_patches * num_frames);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (file_size(needed), file_size(available));
         usage_bail!(

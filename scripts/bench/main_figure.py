@@ -1,0 +1,118 @@
+#!/usr/bin/env python3
+"""The paper's main figure: CLiFT of one training at every size against an LVSM encoder-decoder trained for each size.
+
+Trains CLiFT, then LVSM for every number of latents twice: for as many steps as both stages of CLiFT together, and for as
+long as their steps took. Further seeds train CLiFT and the smallest LVSM. Every seed is evaluated with `clift eval
+--preset main --with ..`; the tables have PSNR with its standard error (over seeds, where there are several, else over
+scenes), tokens, values, bytes, GMAC and measured time a view. Keep the machine quiet: the second table depends on the
+times of steps. Trainings resume; finished ones are kept.
+
+    python3 scripts/bench/main_figure.py --out runs/main-figure                      # hours on two cores
+    python3 scripts/bench/main_figure.py --clift-config configs/tiny.toml --lvsm-config configs/lvsm-ed-tiny.toml \\
+        --latents 32,64,128 --out runs/main-figure-tiny
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+FORMATS = ["f16", "coded", "coded-0.1"]
+
+
+class Figure:
+    def __init__(self, args: argparse.Namespace):
+        self.exe, self.out, self.set = args.exe.resolve(), args.out.resolve(), args.set
+        self.configs = {"clift": args.clift_config, "lvsm": args.lvsm_config}
+
+    def clift(self, *words: str) -> None:
+        done = subprocess.run([self.exe, *words], cwd=ROOT)
+        if done.returncode:
+            raise SystemExit(f"clift {' '.join(words)}: exit code {done.returncode}")
+
+    def train(self, kind: str, name: str, seed: int, *changes: str) -> Path:
+        run = self.out / name
+        changes = (f"run_dir={json.dumps(str(run))}", f"seed={seed}", *changes, *self.set)
+        self.clift("train", str(self.configs[kind]), *(word for change in changes for word in ("--set", change)))
+        return run
+
+    def evaluate(self, run: Path, others: list[Path], name: str) -> list[dict]:
+        out = self.out / f"eval-{name}"
+        if not (out / "summary.json").exists():
+            beside = [word for other in others for word in ("--with", str(other))]
+            self.clift("eval", str(run), "--preset", "main", *beside, "--out", str(out))
+        return json.loads((out / "summary.json").read_text())["points"]
+
+
+def steps(run: Path) -> list[float]:
+    """Seconds of every step of all stages."""
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [row["step_s"] for row in rows]
+
+
+def cell(values: list[float], digits: int) -> str:
+    return f"{statistics.fmean(values):.{digits}f}" if all(value is not None for value in values) else "-"
+
+
+def table(title: str, evaluations: list[list[dict]]) -> None:
+    found: dict[tuple, list[dict]] = {}
+    for points in evaluations:
+        for point in points:
+            key = (point["variant"], FORMATS.index(point["tokens"]), point["num_storage_tokens"])
+            found.setdefault(key, []).append(point)
+    print(f"\n{title}\n\n| method | tokens | storage | seeds | PSNR dB | SSIM | values | kB | GMAC | ms a view |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for (method, storage, tokens), points in sorted(found.items()):
+        psnr = [point["psnr"] for point in points]
+        error = points[0]["psnr_stderr"] if len(psnr) == 1 else statistics.stdev(psnr) / len(psnr) ** 0.5
+        of = lambda name, factor, digits: cell([point[name] and point[name] * factor for point in points], digits)
+        print(
+            f"| {method} | {tokens} | {FORMATS[storage]} | {len(psnr)} | {statistics.fmean(psnr):.2f} +- {error or 0:.2f} "
+            f"| {of('ssim', 1, 3)} | {points[0]['scene_values']} | {of('scene_bytes', 1e-3, 1)} | {of('gflops', 1, 3)} "
+            f"| {of('render_median_s', 1e3, 1)} |"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The paper's main figure, CLiFT against LVSM-ED.")
+    parser.add_argument("--exe", type=Path, default=ROOT / "target/release/clift")
+    parser.add_argument("--clift-config", type=Path, default=ROOT / "configs/synthetic.toml")
+    parser.add_argument("--lvsm-config", type=Path, default=ROOT / "configs/lvsm-ed-synthetic.toml")
+    parser.add_argument("--out", type=Path, default=ROOT / "runs/main-figure")
+    parser.add_argument("--latents", default="64,256,1024", help="numbers of latents, the smallest first")
+    parser.add_argument("--seeds", default="0,1,2", help="the first trains every size, the others the smallest")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=TOML", help="changes both configs")
+    args = parser.parse_args()
+    figure, latents = Figure(args), [int(count) for count in args.latents.split(",")]
+    evaluations: dict[str, list[list[dict]]] = {"steps": [], "time": []}
+    for number, seed in enumerate(int(seed) for seed in args.seeds.split(",")):
+        clift = figure.train("clift", f"clift-{seed}", seed)
+        budget = steps(clift)
+        others: dict[str, list[Path]] = {"steps": [], "time": []}
+        for count in latents[: 1 if number else None]:
+
+            def lvsm(kind: str, num_steps: int) -> Path:
+                changes = (f"model.num_latents={count}", f"stage1.steps={num_steps}")
+                return figure.train("lvsm", f"lvsm-{count}-{kind}-{seed}", seed, *changes)
+
+            others["steps"].append(lvsm("steps", len(budget)))
+            seconds = statistics.median(steps(others["steps"][-1]))
+            # Written down once: a resumed training needs the same number of steps.
+            file = figure.out / f"lvsm-{count}-time-{seed}.json"
+            if not file.exists():
+                file.write_text(json.dumps(round(sum(budget) / seconds)))
+            others["time"].append(lvsm("time", json.loads(file.read_text())))
+        for kind, runs in others.items():
+            evaluations[kind].append(figure.evaluate(clift, runs, f"{kind}-{seed}"))
+            sizes = ", ".join(f"{run.name}: {len(steps(run))} steps, {sum(steps(run)):.0f} s" for run in [clift, *runs])
+            print(f"seed {seed}, equal {kind}: {sizes}")
+    for kind, points in evaluations.items():
+        table(f"Equal {kind}", points)
+
+
+if __name__ == "__main__":
+    main()
