@@ -13,7 +13,7 @@ pub(crate) const SUMMARY: &str = "summary.json";
 #[derive(Debug)]
 pub struct EvalFolder {
     path: PathBuf,
-    _lock: RunLock,
+    _lock: Option<RunLock>,
 }
 
 impl EvalFolder {
@@ -29,7 +29,12 @@ impl EvalFolder {
             let fix = "the folder holds an evaluation; replace it with --force, or set another --out";
             return Err(bad("--out", path.display(), fix));
         }
-        Ok(Self { path: path.into(), _lock: lock })
+        Ok(Self { path: path.into(), _lock: Some(lock) })
+    }
+
+    /// Returns the folder of a rank that does not write.
+    pub(crate) fn unlocked(path: PathBuf) -> Self {
+        Self { path, _lock: None }
     }
 
     /// Returns the path of the folder.

@@ -8,6 +8,7 @@ use clift_eval::{EvalFrames, EvalModels, Method, Summary};
 use clift_model::{ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
+use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
 use crate::run::validation::{EvalRequest, Validation};
@@ -62,5 +63,5 @@ pub fn evaluate_model(
     let frames = EvalFrames::new(&opened, split, 0, false);
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     let validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
-    validation.evaluate(&models, request, stop, sink)
+    validation.evaluate(&models, request, &Ranks::single(), stop, sink)
 }
