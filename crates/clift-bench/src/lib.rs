@@ -38,4 +38,4 @@ pub use doctor::probe::{DeviceCheck, Gradient, catch_panic, probe};
 pub use doctor::stability::case::{Bound, CaseSize, Outcome, StabilityCase, StabilityRow};
 pub use doctor::stability::suite::{outcome_text, run_stability, stability_markdown};
 // Memory and time of a run before it starts
-pub use plan::plan::{PartPlan, Plan, check_plan, missing_weights, plan};
+pub use plan::plan::{PartPlan, Plan, PlanOptions, check_plan, missing_weights, plan};

@@ -45,7 +45,7 @@ pub use config::parse::{ConfigError, parse_config, read_checked_config, read_con
 pub use distributed::communicator::Communicator;
 pub use distributed::launch::Launched;
 pub use distributed::machine::RankPlace;
-pub use distributed::parts::Parts;
+pub use distributed::parts::BatchParts;
 pub use distributed::ranks::Ranks;
 // A run, its events and errors
 pub use error::TrainError;

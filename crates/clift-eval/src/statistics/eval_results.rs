@@ -83,7 +83,9 @@ impl EvalResults {
             self.costs.entry(key).or_insert(cost);
         }
         for (key, sizes) in other.scene_bytes {
-            sizes.into_iter().for_each(|bytes| self.add_scene_bytes(key, bytes));
+            for bytes in sizes {
+                self.add_scene_bytes(key, bytes);
+            }
         }
         for (method, images) in other.missing {
             self.missing.entry(method).or_default().extend(images);

@@ -60,9 +60,10 @@ fn connect(num_ranks: usize) -> Result<Ranks, TrainError> {
 
 #[cfg(not(feature = "mpi"))]
 fn connect(num_ranks: usize) -> Result<Ranks, TrainError> {
-    let reason = "this build has no MPI: rebuild with `cargo build --release --features mpi` (on Debian after `apt-get \
+    let reason =
+        "this build has no MPI: rebuild with `cargo build --release --features mpi` (on Debian after `apt-get \
                   install openmpi-bin libopenmpi-dev libclang-dev`), or start one process"
-        .into();
+            .into();
     Err(TrainError::NoMpi { num_ranks, reason })
 }
 

@@ -59,8 +59,7 @@ impl Communicator for ThreadRank {
 
 /// Runs `work` on `num_ranks` ranks, and returns the results by rank. A panic of one ends all.
 pub fn on_threads<T: Send>(num_ranks: usize, work: impl Fn(Ranks) -> T + Sync) -> Vec<T> {
-    let mut ends: Vec<_> =
-        (0..num_ranks).map(|rank| ThreadRank { rank, to: Vec::new(), from: Vec::new() }).collect();
+    let mut ends: Vec<_> = (0..num_ranks).map(|rank| ThreadRank { rank, to: Vec::new(), from: Vec::new() }).collect();
     for from in 0..num_ranks {
         for to in 0..num_ranks {
             let (sender, receiver) = channel();

@@ -21,7 +21,7 @@ use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_resume_log;
 use crate::config::config::Config;
 use crate::distributed::machine::RankPlace;
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
@@ -130,7 +130,8 @@ impl Run {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
         let summary = self.folder("eval").join(SUMMARY);
         // Rank 0 looks at the files for all.
-        let trained = self.ranks.from_root(|| Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists())))?;
+        let trained =
+            self.ranks.from_root(|| Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists())))?;
         let [has_stage1, has_stage2] = trained;
         let is_trained = has_stage1 && has_stage2;
         if self.ranks.from_root(|| Ok(only.is_none() && is_trained && summary.exists()))? {
@@ -169,7 +170,8 @@ impl Run {
             require_run(&self.config.run_dir)?;
             Ok(self.folder("eval"))
         })?;
-        let folder = if self.ranks.is_root() { EvalFolder::open(&folder, true, sink)? } else { EvalFolder::unlocked(folder) };
+        let folder =
+            if self.ranks.is_root() { EvalFolder::open(&folder, true, sink)? } else { EvalFolder::unlocked(folder) };
         let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
         let summary = validation.evaluate(&self.models(sink)?, &request, &self.ranks, stop, sink)?;
         Ok(self.ranks.is_root().then_some(summary))
@@ -304,9 +306,9 @@ impl Run {
         self.ranks.from_root(|| Ok(save_weights(&model, &self.weights(Stage::Stage2))?))
     }
 
-    fn parts(&self, stage: Stage) -> Parts {
+    fn parts(&self, stage: Stage) -> BatchParts {
         let StageSettings { batch_size, accumulate, .. } = self.config.stage(stage);
-        Parts::new(batch_size, accumulate, &self.ranks)
+        BatchParts::new(batch_size, accumulate, &self.ranks)
     }
 
     fn plan(&self, stage: Stage, batches: Arc<MakeBatch>) -> StagePlan<'_> {

@@ -10,7 +10,7 @@ use burn::tensor::Device;
 use clift_data::Prefetcher;
 
 use crate::config::config::Config;
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::stage::settings::StageSettings;
@@ -31,7 +31,7 @@ pub struct StagePlan<'a> {
     pub device: Device,
     pub ranks: &'a Ranks,
     /// Division of the batch of a step.
-    pub parts: Parts,
+    pub parts: BatchParts,
 }
 
 impl StagePlan<'_> {

@@ -9,7 +9,7 @@ use clift_model::{Clift, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, Progress};
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
@@ -328,14 +328,17 @@ fn require_same_weights(train_state: &TrainState, ranks: &Ranks) -> Result<(), T
 }
 
 /// Describes how several ranks share a batch.
-fn parts_notes(parts: Parts, ranks: &Ranks) -> Vec<String> {
+fn parts_notes(parts: BatchParts, ranks: &Ranks) -> Vec<String> {
     let (num_ranks, num_parts, num_scenes) = (ranks.num_ranks(), parts.num_parts(), parts.batch_size());
     if num_ranks == 1 {
         return Vec::new();
     }
-    let mut notes = vec![format!("{num_ranks} ranks share batches of {} in {num_parts} parts", plural(num_scenes, "scene"))];
+    let mut notes =
+        vec![format!("{num_ranks} ranks share batches of {} in {num_parts} parts", plural(num_scenes, "scene"))];
     if !num_parts.is_multiple_of(num_ranks) {
-        notes.push(format!("{num_parts} parts leave ranks idle; a multiple of {num_ranks} in accumulate keeps them busy"));
+        notes.push(format!(
+            "{num_parts} parts leave ranks idle; a multiple of {num_ranks} in accumulate keeps them busy"
+        ));
     }
     notes
 }

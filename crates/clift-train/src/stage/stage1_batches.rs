@@ -7,7 +7,7 @@ use rand::RngExt;
 use rand::seq::index::sample;
 
 use crate::config::config::Config;
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 
@@ -16,13 +16,13 @@ pub struct Stage1Batches {
     clips: TrainingClips,
     keep_tokens: [f64; 2],
     tokens_per_view: usize,
-    parts: Parts,
+    parts: BatchParts,
     seed: u64,
 }
 
 impl Stage1Batches {
     /// Makes batches of the slots that `parts` gives to this rank.
-    pub fn new(config: &Config, reader: &ClipReader, parts: Parts) -> Result<Self, TrainError> {
+    pub fn new(config: &Config, reader: &ClipReader, parts: BatchParts) -> Result<Self, TrainError> {
         let seed = derive_seed(config.seed, "stage1");
         let read = reader.clone();
         let clips = TrainingClips::new(

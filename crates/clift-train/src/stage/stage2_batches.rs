@@ -11,7 +11,7 @@ use clift_model::SceneClusters;
 
 use crate::cluster_cache::cache::{CacheEntry, ClusterCache};
 use crate::config::config::Config;
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 
@@ -24,7 +24,7 @@ pub struct Stage2Batches {
     cache: Arc<ClusterCache>,
     /// Entries with equal numbers of tokens and of clusters, which a batch needs.
     groups: Vec<Vec<usize>>,
-    parts: Parts,
+    parts: BatchParts,
     num_targets: usize,
     seed: u64,
 }
@@ -35,7 +35,7 @@ impl Stage2Batches {
         config: &Config,
         reader: &ClipReader,
         cache: Arc<ClusterCache>,
-        parts: Parts,
+        parts: BatchParts,
     ) -> Result<Self, TrainError> {
         let mut groups: BTreeMap<_, Vec<usize>> = BTreeMap::new();
         for (i, entry) in cache.entries().iter().enumerate() {

@@ -4,7 +4,7 @@
 use clift_data::{Clip, SkippedScene};
 use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters, Tokens};
 
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
 
 /// Clips of an update, with equal numbers of views, and the tokens from which they are rendered. A rank has those of its
@@ -40,7 +40,7 @@ pub enum TokenSelection {
 
 impl StageBatch {
     /// Returns the part of every round; `None` where this rank has none.
-    pub(crate) fn rounds(&self, parts: Parts) -> impl Iterator<Item = Option<MicroBatch<'_>>> {
+    pub(crate) fn rounds(&self, parts: BatchParts) -> impl Iterator<Item = Option<MicroBatch<'_>>> {
         let mut start = 0;
         (0..parts.num_rounds()).map(move |round| {
             let count = parts.slots_of_round(round).len();

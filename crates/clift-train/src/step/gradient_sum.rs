@@ -36,7 +36,8 @@ impl GradientSum {
         num_working: usize,
         ranks: &Ranks,
     ) -> Result<(), TrainError> {
-        let mut flatten = Flatten { grads, has_gradient: Vec::new(), pending: Vec::new(), values: Vec::new(), failure: None };
+        let mut flatten =
+            Flatten { grads, has_gradient: Vec::new(), pending: Vec::new(), values: Vec::new(), failure: None };
         module.visit(&mut flatten);
         flatten.copy();
         let Flatten { has_gradient, values, failure, .. } = flatten;

@@ -6,7 +6,7 @@ use clift_data::{Clip, SkippedScene, median};
 use serde::{Deserialize, Serialize};
 
 use crate::config::config::OptimizerConfig;
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::Stage;
@@ -120,7 +120,7 @@ pub struct BatchScenes {
 
 impl BatchScenes {
     /// Joins the scenes of all ranks. `batch` has those of this rank's slots.
-    pub fn gather(batch: &StageBatch, parts: Parts, ranks: &Ranks) -> Result<Self, TrainError> {
+    pub fn gather(batch: &StageBatch, parts: BatchParts, ranks: &Ranks) -> Result<Self, TrainError> {
         let scenes: Vec<_> = parts.slots().zip(batch.clips.iter().map(SkippedStepScene::of)).collect();
         let (scenes, skipped): (Vec<_>, Vec<_>) = ranks.gather((scenes, batch.skipped.clone()))?.into_iter().unzip();
         Ok(Self { scenes: in_order(scenes), skipped: in_order(skipped) })

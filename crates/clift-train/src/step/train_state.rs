@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 
 use crate::config::config::OptimizerConfig;
-use crate::distributed::parts::Parts;
+use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::step::activation_checkpointing;
@@ -66,7 +66,7 @@ impl TrainState {
         max_grad_norm: f64,
     ) -> Result<(Self, Update), TrainError> {
         let ranks = Ranks::single();
-        let parts = Parts::new(batch.clips.len(), accumulate, &ranks);
+        let parts = BatchParts::new(batch.clips.len(), accumulate, &ranks);
         let accept = |loss: f64, norm: f64| loss.is_finite() && norm.is_finite();
         self.step_if(batch, (parts, &ranks), rate, max_grad_norm, accept)
     }
@@ -81,7 +81,7 @@ impl TrainState {
     pub fn step_if(
         self,
         batch: &StageBatch,
-        (parts, ranks): (Parts, &Ranks),
+        (parts, ranks): (BatchParts, &Ranks),
         rate: ModuleLearningRate,
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
@@ -165,15 +165,22 @@ impl HostReads {
     /// for all; 0 without gradients. The update is not applied yet.
     fn finish(mut self, grad_norm: Option<Tensor<1>>, ranks: &Ranks) -> Result<Update, TrainError> {
         self.values.extend(grad_norm);
-        let values = if self.values.is_empty() { Ok(Vec::new()) } else { Tensor::cat(self.values, 0).try_into_vec_as::<f64>() };
+        let values =
+            if self.values.is_empty() { Ok(Vec::new()) } else { Tensor::cat(self.values, 0).try_into_vec_as::<f64>() };
         let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
         let (losses, norm) = values.split_at(2 * self.shares.len());
-        let own: Vec<_> =
-            losses.as_chunks::<2>().0.iter().zip(&self.shares).map(|(of, share)| of.map(|value| share * value)).collect();
+        let own: Vec<_> = losses
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .zip(&self.shares)
+            .map(|(of, share)| of.map(|value| share * value))
+            .collect();
         let all = ranks.gather((own, norm.first().copied().unwrap_or(0.0)))?;
         let num_rounds = all[0].0.len();
         let of = |i: usize| {
-            let in_order = (0..num_rounds).flat_map(|round| all.iter().filter_map(move |(losses, _)| losses.get(round)));
+            let in_order =
+                (0..num_rounds).flat_map(|round| all.iter().filter_map(move |(losses, _)| losses.get(round)));
             in_order.map(|losses| losses[i]).sum()
         };
         Ok(Update { loss: of(0), mse: of(1), grad_norm: all[0].1, applied: false })
