@@ -20,3 +20,10 @@ pub fn connect() -> Result<Rc<Ranks>, TrainError> {
     }
     Ok(Rc::new(ranks))
 }
+
+/// Ends the work of all ranks. Rank 0 alone returns an error, its own or that of another rank: a launcher ends the other
+/// ranks with the first that fails.
+pub fn finish(ranks: &Ranks, result: anyhow::Result<()>) -> anyhow::Result<()> {
+    let result = ranks.finish(result);
+    if ranks.is_root() { result } else { Ok(()) }
+}

@@ -8,14 +8,14 @@ use clift_train::{Config, Ranks, Run, RunOptions, Stage, memory_warning};
 
 use crate::commands::args::parse::{parse_count, parse_stage};
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::commands::ranks::connect;
+use crate::commands::ranks::{connect, finish};
 use crate::interrupt;
 use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_run, print_warning};
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let ranks = connect()?;
-    ranks.finish(train(args, &ranks))
+    finish(&ranks, train(args, &ranks))
 }
 
 fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {

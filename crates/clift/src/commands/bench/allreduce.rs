@@ -4,7 +4,7 @@ use clift_bench::{AllReduceReport, AllReduceRow, measure_allreduce};
 
 use crate::commands::args::parse::parse_count;
 use crate::commands::args::shared_args::JsonArg;
-use crate::commands::ranks::connect;
+use crate::commands::ranks::{connect, finish};
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 use crate::output::units::{file_size, seconds};
@@ -33,7 +33,7 @@ pub fn run(args: &BenchAllReduceArgs) -> anyhow::Result<()> {
         }
         Ok(())
     };
-    ranks.finish(measure())
+    finish(&ranks, measure())
 }
 
 fn report_text(report: &AllReduceReport) -> String {
