@@ -201,7 +201,9 @@ impl Evaluator {
             measured.skipped.insert(key.clone());
             skip_report.skip(key, reason);
         }
-        progress.done(total, total);
+        if process.count > 1 {
+            progress.done(total, total);
+        }
         Ok((measured, skip_report))
     }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 use clift_eval::available_bytes;
-use clift_train::{Config, Ranks, Run, RunOptions, Stage, memory_warning};
+use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, Stage, StageSettings, memory_warning};
 
 use crate::commands::args::parse::{parse_count, parse_stage};
 use crate::commands::args::shared_args::ConfigArgs;
@@ -21,7 +21,12 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
 fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, Config::validate)?;
     // Before the system ends a run for its memory after hours of training.
-    if let Ok(Some(warning)) = memory_warning(&config, available_bytes(config.device)) {
+    let mut of_rank = config.clone();
+    for stage in [Stage::Stage1, Stage::Stage2] {
+        let StageSettings { batch_size, accumulate, .. } = config.stage(stage);
+        of_rank.set_accumulate(stage, BatchParts::new(batch_size, accumulate, ranks).num_parts());
+    }
+    if let Ok(Some(warning)) = memory_warning(&of_rank, available_bytes(config.device)) {
         print_warning(warning);
     }
     let stop = interrupt::flag()?;
