@@ -45,6 +45,11 @@ fn counts(ranges: &[Range<usize>]) -> (Vec<i32>, Vec<i32>) {
     ranges.iter().map(|range| (count(range.len()), count(range.start))).unzip()
 }
 
+/// Returns the end of ranges that follow one another. Open MPI refuses an exchange of nothing.
+fn end_of(ranges: &[Range<usize>]) -> usize {
+    ranges.last().map_or(0, |last| last.end)
+}
+
 /// Returns the ranges of chunks of these lengths, one after the other.
 fn ranges_of(lengths: impl IntoIterator<Item = usize>) -> Vec<Range<usize>> {
     let mut end = 0;
@@ -68,9 +73,11 @@ impl Communicator for MpiRank {
         let mut lengths = vec![0_u64; self.num_ranks()];
         self.world.all_gather_into(&(message.len() as u64), &mut lengths[..]);
         let ranges = ranges_of(lengths.into_iter().map(|len| len as usize));
-        let mut all = vec![0_u8; ranges.last().map_or(0, |last| last.end)];
-        let (counts, starts) = counts(&ranges);
-        self.world.all_gather_varcount_into(message, &mut PartitionMut::new(&mut all[..], counts, &starts[..]));
+        let mut all = vec![0_u8; end_of(&ranges)];
+        if !all.is_empty() {
+            let (counts, starts) = counts(&ranges);
+            self.world.all_gather_varcount_into(message, &mut PartitionMut::new(&mut all[..], counts, &starts[..]));
+        }
         ranges.into_iter().map(|range| all[range].to_vec()).collect()
     }
 
@@ -80,6 +87,9 @@ impl Communicator for MpiRank {
         let sent = if rank < num_senders { ranges.to_vec() } else { vec![0..0; ranges.len()] };
         let received = ranges_of((0..ranges.len()).map(|sender| if sender < num_senders { own } else { 0 }));
         let mut all = vec![0.0; num_senders * own];
+        if end_of(ranges) == 0 {
+            return all;
+        }
         let ((sent, sent_at), (got, got_at)) = (counts(&sent), counts(&received));
         self.world.all_to_all_varcount_into(
             &Partition::new(values, sent, &sent_at[..]),
@@ -89,6 +99,9 @@ impl Communicator for MpiRank {
     }
 
     fn all_gather_values(&self, values: &mut [f32], ranges: &[Range<usize>]) {
+        if values.is_empty() {
+            return;
+        }
         let own = values[ranges[self.rank()].clone()].to_vec();
         let (counts, starts) = counts(ranges);
         self.world.all_gather_varcount_into(&own[..], &mut PartitionMut::new(values, counts, &starts[..]));
