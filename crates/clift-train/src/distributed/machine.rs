@@ -2,6 +2,10 @@
 
 use std::num::NonZero;
 
+use burn::tensor::Device;
+use clift_data::plural;
+use clift_model::DeviceName;
+
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 
@@ -43,6 +47,21 @@ impl RankPlace {
             num_threads: (num_cores / num_sharing).max(1),
         }
     }
+}
+
+/// Opens the device of this rank. Returns also the places of all ranks as text, if there are several.
+///
+/// # Errors
+/// Those of the device, and of [`Ranks::gather`].
+pub(crate) fn open_device(name: DeviceName, ranks: &Ranks) -> Result<(Device, Vec<String>), TrainError> {
+    if ranks.num_ranks() == 1 {
+        return Ok((name.open()?, Vec::new()));
+    }
+    let place = RankPlace::find(ranks)?;
+    let (device, adapter) = name.open_nth(place.local_rank)?;
+    let text = adapter.unwrap_or_else(|| format!("{name} with {}", plural(place.num_threads, "thread")));
+    let places = ranks.gather(format!("{text} of {}", place.host))?;
+    Ok((device, (0..).zip(places).map(|(rank, text): (usize, String)| format!("rank {rank}: {text}")).collect()))
 }
 
 fn host_name() -> String {

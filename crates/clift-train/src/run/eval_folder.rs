@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_eval::Summary;
+
 use crate::error::{TrainError, bad};
 use crate::events::Sink;
 use crate::run::lock::{LockedFolder, RunLock};
@@ -47,6 +49,12 @@ impl EvalFolder {
         let real = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.into());
         real(&self.path).starts_with(real(folder))
     }
+}
+
+/// Reads the summary of an evaluation.
+pub(crate) fn read_summary(path: &Path) -> Result<Summary, TrainError> {
+    let text = std::fs::read(path).map_err(TrainError::io("reading the evaluation", path))?;
+    serde_json::from_slice(&text).map_err(TrainError::bad_file("evaluation", path))
 }
 
 #[cfg(test)]

@@ -7,9 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::{
-    ClipReader, OpenedSource, SceneSource, SceneSubset, Split, open_dataset, open_training_dataset, plural,
-};
+use clift_data::{ClipReader, OpenedSource, SceneSource, SceneSubset, Split, open_dataset, open_training_dataset};
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
     Clift, ModelError, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights,
@@ -20,14 +18,14 @@ use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_resume_log;
 use crate::config::config::Config;
-use crate::distributed::machine::RankPlace;
+use crate::distributed::machine::open_device;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
-use crate::run::eval_folder::{EvalFolder, SUMMARY};
+use crate::run::eval_folder::{EvalFolder, SUMMARY, read_summary};
 use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
@@ -77,7 +75,10 @@ impl Run {
             config.data.hold_out = 0;
         }
         config.validate()?;
-        let device = open_device(&config, &ranks, sink)?;
+        let (device, places) = open_device(config.device, &ranks)?;
+        for place in places {
+            sink.event(&Event::Message(place));
+        }
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
         largest_tensor::check_tensors(&config, &device, &PARTS)?;
@@ -112,8 +113,7 @@ impl Run {
         check_heads(&config.model, &config.run_dir)?;
         let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
-        let ranks = Rc::new(Ranks::single());
-        Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None, ranks })
+        Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None, ranks: Ranks::single().into() })
     }
 
     /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run, on rank
@@ -130,9 +130,8 @@ impl Run {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
         let summary = self.folder("eval").join(SUMMARY);
         // Rank 0 looks at the files for all.
-        let trained =
-            self.ranks.from_root(|| Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists())))?;
-        let [has_stage1, has_stage2] = trained;
+        let has_weights = || Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists()));
+        let [has_stage1, has_stage2] = self.ranks.from_root(has_weights)?;
         let is_trained = has_stage1 && has_stage2;
         if self.ranks.from_root(|| Ok(only.is_none() && is_trained && summary.exists()))? {
             return self.finished(&summary, sink);
@@ -146,7 +145,6 @@ impl Run {
         let frames = EvalFrames::new(&opened, Split::Train, self.config.data.hold_out, true);
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
-
         let stage1 = if wanted(Stage::Stage1) && !has_stage1 {
             self.train_stage1(&reader, &validation, stop, sink)?
         } else {
@@ -166,10 +164,8 @@ impl Run {
             return Ok(None);
         }
         // After rank 0 has fitted the codec, which all ranks read.
-        let folder = self.ranks.from_root(|| {
-            require_run(&self.config.run_dir)?;
-            Ok(self.folder("eval"))
-        })?;
+        self.ranks.from_root(|| require_run(&self.config.run_dir))?;
+        let folder = self.folder("eval");
         let folder =
             if self.ranks.is_root() { EvalFolder::open(&folder, true, sink)? } else { EvalFolder::unlocked(folder) };
         let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
@@ -186,8 +182,7 @@ impl Run {
         sink.event(&Event::Message(format!(
             "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
         )));
-        let text = std::fs::read(summary).map_err(TrainError::io("reading the evaluation", summary))?;
-        serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", summary))
+        read_summary(summary).map(Some)
     }
 
     /// Evaluates the run. `beside` is another run with the same stage 1 whose stage 2 was trained on other groups of tokens,
@@ -400,20 +395,6 @@ impl Run {
     fn weights(&self, stage: Stage) -> PathBuf {
         self.folder(stage.name()).join("model.safetensors")
     }
-}
-
-/// Opens the device of this rank, and lists the places of several ranks.
-fn open_device(config: &Config, ranks: &Ranks, sink: &mut dyn Sink) -> Result<Device, TrainError> {
-    if ranks.num_ranks() == 1 {
-        return Ok(config.device.open()?);
-    }
-    let place = RankPlace::find(ranks)?;
-    let (device, name) = config.device.open_nth(place.local_rank)?;
-    let name = name.unwrap_or_else(|| format!("{} with {}", config.device, plural(place.num_threads, "thread")));
-    for (rank, text) in ranks.gather(format!("{name} of {}", place.host))?.into_iter().enumerate() {
-        sink.event(&Event::Message(format!("rank {rank}: {text}")));
-    }
-    Ok(device)
 }
 
 #[cfg(test)]
