@@ -58,7 +58,7 @@ fn a_full_disk_ends_all_with_one_message() {
 fn a_wrong_config_is_reported_once() {
     let _one = one_at_a_time();
     let place = Place::new();
-    let ran = finish(start_train(&place, 2, "run", &["stage1.steps=0"]));
+    let ran = finish(start_train(&place, 2, "run", &["stage1.batch_size=0"]));
     assert_eq!(ran.code, Some(2), "{}", ran.stderr);
     assert_eq!(ran.stderr.matches("error: ").count(), 1, "{}", ran.stderr);
 }

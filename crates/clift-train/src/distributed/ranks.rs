@@ -78,8 +78,9 @@ impl Ranks {
         &self,
         make: impl FnOnce() -> Result<T, TrainError>,
     ) -> Result<T, TrainError> {
-        let own = if self.is_root() { Some(make()?) } else { None };
-        Ok(self.gather(own)?.swap_remove(0).expect("rank 0 made a value"))
+        // A list: CBOR writes `Some(None)` as `None`.
+        let own = if self.is_root() { vec![make()?] } else { Vec::new() };
+        Ok(self.gather(own)?.swap_remove(0).pop().expect("rank 0 made a value"))
     }
 
     /// Returns whether the flag of any rank is set.
@@ -250,6 +251,11 @@ mod tests {
     fn rank_0_decides_and_differences_are_found() {
         let all = on_threads(3, |ranks| ranks.from_root(|| Ok(ranks.rank() + 5)).unwrap());
         assert_eq!(all, [5, 5, 5]);
+        for value in [None, Some(3)] {
+            let none = on_threads(2, |ranks| ranks.from_root(|| Ok(ranks.is_root().then_some(value).flatten())).unwrap());
+            assert_eq!(none, [value, value]);
+        }
+        on_threads(2, |ranks| ranks.from_root(|| Ok(())).unwrap());
         assert_eq!(on_threads(3, |ranks| ranks.any(ranks.rank() == 2).unwrap()), [true; 3]);
         let found = on_threads(3, |ranks| {
             let value = if ranks.rank() == 1 { "b" } else { "a" };
