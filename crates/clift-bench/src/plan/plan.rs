@@ -337,7 +337,8 @@ mod tests {
     #[test]
     fn ranks_share_batches_and_scenes() {
         let mut config = config();
-        (config.stage1.batch_size, config.stage1.accumulate, config.clusters.num_scenes) = (16, 4, 90);
+        (config.stage1.batch_size, config.stage1.accumulate) = (16, 4);
+        (config.clusters.num_scenes, config.clusters.num_passes) = (90, 1);
         let of = |num_ranks| plan(&config, &PlanOptions { num_ranks, ..UNTIMED }).expect("valid");
         let [one, two, eight] = [1, 2, 8].map(of);
         let stage1 = |plan: &Plan| plan.parts[0].clone();

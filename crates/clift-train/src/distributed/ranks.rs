@@ -252,7 +252,8 @@ mod tests {
         let all = on_threads(3, |ranks| ranks.from_root(|| Ok(ranks.rank() + 5)).unwrap());
         assert_eq!(all, [5, 5, 5]);
         for value in [None, Some(3)] {
-            let none = on_threads(2, |ranks| ranks.from_root(|| Ok(ranks.is_root().then_some(value).flatten())).unwrap());
+            let none =
+                on_threads(2, |ranks| ranks.from_root(|| Ok(ranks.is_root().then_some(value).flatten())).unwrap());
             assert_eq!(none, [value, value]);
         }
         on_threads(2, |ranks| ranks.from_root(|| Ok(())).unwrap());

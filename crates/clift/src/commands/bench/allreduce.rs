@@ -60,9 +60,9 @@ mod tests {
         let expected = "\
 2 ranks, a message to all: 25 us
 
-values    size     median  p95     sent by a rank
-1         4 bytes  100 ms  200 ms  -
-25000000  100 MB   100 ms  200 ms  1.00 GB/s";
+values    size      median  p95     sent by a rank
+1         4 bytes   100 ms  200 ms  -
+25000000  100.0 MB  100 ms  200 ms  1.00 GB/s";
         assert_eq!(report_text(&report), expected);
     }
 }
