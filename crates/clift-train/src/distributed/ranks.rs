@@ -13,6 +13,8 @@ use crate::error::TrainError;
 /// First byte of a message: a value follows, or the text of an error.
 const VALUE: u8 = 0;
 const FAILURE: u8 = 1;
+/// Values that are exchanged at once, 4 MB: larger buffers are new memory at every exchange.
+const BLOCK: usize = 1 << 20;
 
 /// The ranks of a run, seen from one of them.
 ///
@@ -137,33 +139,45 @@ impl Ranks {
         Ok(all)
     }
 
-    /// Returns the range of `len` values that each rank adds up.
-    pub(crate) fn ranges(&self, len: usize) -> Vec<Range<usize>> {
+    /// Returns the range of a block of `len` values that each rank adds up.
+    fn ranges(&self, len: usize) -> Vec<Range<usize>> {
         let num_ranks = self.num_ranks();
         (0..num_ranks).map(|rank| rank * len / num_ranks..(rank + 1) * len / num_ranks).collect()
     }
 
-    /// Adds the `values` of the first `num_senders` ranks, in their order, to `sum`, which holds this rank's range of
-    /// [`Ranks::ranges`], or nothing before the first call.
-    pub(crate) fn add_range(&self, values: &[f32], len: usize, num_senders: usize, sum: &mut Vec<f32>) {
-        let ranges = self.ranges(len);
-        let own = ranges[self.rank()].len();
-        let received = self.communicator.all_to_all(values, &ranges, num_senders);
-        for range in received.chunks_exact(own.max(1)) {
-            if sum.is_empty() {
-                sum.extend_from_slice(range);
-            } else {
-                sum.iter_mut().zip(range).for_each(|(sum, value)| *sum += value);
+    /// Adds the `len` values of the first `num_senders` ranks, in their order, to `sum`, which holds this rank's range of
+    /// every block, or nothing before the first call.
+    pub(crate) fn add_ranges(&self, values: &[f32], len: usize, num_senders: usize, sum: &mut Vec<f32>) {
+        let (is_first, mut start) = (sum.is_empty(), 0);
+        for block in blocks(len) {
+            let ranges = self.ranges(block.len());
+            let own = ranges[self.rank()].len();
+            // A rank that does not send has no values.
+            let sent = values.get(block).unwrap_or_default();
+            let received = self.communicator.all_to_all(sent, &ranges, num_senders);
+            let mut of_senders = received.chunks_exact(own.max(1));
+            if is_first {
+                sum.extend_from_slice(of_senders.next().unwrap_or_default());
             }
+            let target = &mut sum[start..start + own];
+            for values in of_senders {
+                target.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+            }
+            start += own;
         }
     }
 
-    /// Returns all `len` values, of which every rank has its range of [`Ranks::ranges`].
-    pub(crate) fn join_ranges(&self, own: &[f32], len: usize) -> Vec<f32> {
-        let ranges = self.ranges(len);
+    /// Returns all `len` values, of which every rank has its range of every block.
+    pub(crate) fn join_ranges(&self, mut own: &[f32], len: usize) -> Vec<f32> {
         let mut values = vec![0.0; len];
-        values[ranges[self.rank()].clone()].copy_from_slice(own);
-        self.communicator.all_gather_values(&mut values, &ranges);
+        for block in blocks(len) {
+            let (ranges, target) = (self.ranges(block.len()), &mut values[block]);
+            let of_rank = ranges[self.rank()].clone();
+            let (first, rest) = own.split_at(of_rank.len());
+            target[of_rank].copy_from_slice(first);
+            self.communicator.all_gather_values(target, &ranges);
+            own = rest;
+        }
         values
     }
 
@@ -174,9 +188,14 @@ impl Ranks {
     pub fn sum(&self, values: &[f32]) -> Result<Vec<f32>, TrainError> {
         self.require_same("the number of summed values", &values.len().to_string())?;
         let mut sum = Vec::new();
-        self.add_range(values, values.len(), self.num_ranks(), &mut sum);
+        self.add_ranges(values, values.len(), self.num_ranks(), &mut sum);
         Ok(self.join_ranges(&sum, values.len()))
     }
+}
+
+/// Returns the blocks of `len` values.
+fn blocks(len: usize) -> impl Iterator<Item = Range<usize>> {
+    (0..len).step_by(BLOCK).map(move |start| start..len.min(start + BLOCK))
 }
 
 #[cfg(test)]
@@ -203,6 +222,25 @@ mod tests {
     fn fewer_values_than_ranks_are_summed() {
         assert_eq!(on_threads(3, |ranks| ranks.sum(&[1.5]).unwrap()), vec![[4.5]; 3]);
         assert_eq!(on_threads(3, |ranks| ranks.sum(&[]).unwrap()), vec![[0.0; 0]; 3]);
+    }
+
+    #[test]
+    fn long_vectors_are_summed_in_blocks() {
+        let len = 2 * BLOCK + 1001;
+        let value = |rank: usize, i: usize| ((rank + 1) * (i % 4093)) as f32 * 0.3;
+        let sums = on_threads(3, |ranks| {
+            let own: Vec<f32> = (0..len).map(|i| value(ranks.rank(), i)).collect();
+            // Two rounds, of which the second has a part on the first two ranks only.
+            let mut sum = Vec::new();
+            ranks.add_ranges(&own, len, 3, &mut sum);
+            let second = if ranks.rank() < 2 { own } else { Vec::new() };
+            ranks.add_ranges(&second, len, 2, &mut sum);
+            ranks.join_ranges(&sum, len)
+        });
+        for sum in sums {
+            let expected = |i: usize| (1..5).fold(value(0, i), |sum, part| sum + value(part % 3, i));
+            assert!(sum.iter().enumerate().all(|(i, sum)| sum.to_bits() == expected(i).to_bits()));
+        }
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! The sum of the gradients of all parts of a batch, on several ranks.
 //!
-//! Every rank adds up one range of the values, in the order of the parts, and sends its sums to the others: as many bytes as
-//! a ring, and on any number of ranks the sum of one process, bit for bit. Values are in the order of the module.
+//! Every rank adds up a range of every block of values, in the order of the parts, and sends its sums to the others: as
+//! many bytes as a ring, and on any number of ranks the sum of one process, bit for bit. Values are in the order of the
+//! module.
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
@@ -20,7 +21,7 @@ pub(crate) struct GradientSum {
     has_gradient: Vec<bool>,
     /// Number of values of all gradients.
     len: usize,
-    /// The range that this rank adds up.
+    /// The ranges that this rank adds up.
     own: Vec<f32>,
 }
 
@@ -50,7 +51,7 @@ impl GradientSum {
         }
         // Every round has a part on rank 0.
         (self.has_gradient, self.len) = all.into_iter().next().expect("rank 0");
-        ranks.add_range(&values, self.len, num_working, &mut self.own);
+        ranks.add_ranges(&values, self.len, num_working, &mut self.own);
         Ok(())
     }
 
