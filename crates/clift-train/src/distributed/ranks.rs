@@ -13,8 +13,8 @@ use crate::error::TrainError;
 /// First byte of a message: a value follows, or the text of an error.
 const VALUE: u8 = 0;
 const FAILURE: u8 = 1;
-/// Values that are exchanged at once, 4 MB: larger buffers are new memory at every exchange.
-const BLOCK: usize = 1 << 20;
+/// Values that are exchanged at once, 16 MB: the fastest of 4, 16, 64 MB and all on two busy cores.
+const BLOCK: usize = 1 << 22;
 
 /// The ranks of a run, seen from one of them.
 ///
