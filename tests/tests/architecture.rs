@@ -24,12 +24,12 @@ const CRATES: [Crate; 8] = [
     (
         "clift-train",
         "clift-kernels clift-model clift-data clift-eval",
-        "error events config distributed step cluster_cache interchange stage checkpoint footprint token_codec run",
+        "error distributed events config step cluster_cache interchange stage checkpoint footprint token_codec run",
     ),
     (
         "clift-bench",
         "clift-kernels clift-model clift-data clift-eval clift-train",
-        "cases data_reading runner precision doctor plan",
+        "allreduce cases data_reading runner precision doctor plan",
     ),
     ("clift-view", "clift-kernels clift-model clift-data clift-eval", "error protocol scenes session server"),
     (

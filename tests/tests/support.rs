@@ -117,6 +117,24 @@ impl Shared {
     }
 }
 
+/// A small file system in memory, unmounted when dropped; needs root.
+pub struct SmallDisk<'a>(&'a Path);
+
+impl<'a> SmallDisk<'a> {
+    pub fn mount(folder: &'a Path, kib: u64) -> Option<Self> {
+        std::fs::create_dir(folder).expect("writable");
+        let options = format!("size={kib}k");
+        let mount = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "clift-test"]).arg(folder).output();
+        mount.ok().filter(|output| output.status.success()).map(|_| Self(folder))
+    }
+}
+
+impl Drop for SmallDisk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(self.0).status();
+    }
+}
+
 pub struct Place(TempDir);
 
 impl Place {

@@ -104,6 +104,12 @@ pub enum EvalError {
         /// All scenes of the evaluation.
         total: usize,
     },
+    /// Another process that shares the evaluation has failed.
+    #[error("{reason}")]
+    OtherProcess {
+        /// Its error.
+        reason: String,
+    },
     /// Scenes could not be read.
     #[error(transparent)]
     Data(#[from] clift_data::DataError),

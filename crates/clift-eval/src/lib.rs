@@ -60,8 +60,9 @@ pub use config::split::{EvalFrames, EvalSplit};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.
-pub use evaluator::evaluator::{Evaluator, Progress, SceneLimits, write_skip_report};
+pub use evaluator::evaluator::{Evaluator, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
+pub use evaluator::progress::{Process, Progress, SharedScenes};
 pub use report::page::RunDescription;
 pub use report::training::TrainingCurve;
 

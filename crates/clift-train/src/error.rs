@@ -159,6 +159,33 @@ pub enum TrainError {
         /// The unfinished task, as a gerund phrase.
         task: String,
     },
+    /// Another rank of the run has failed.
+    #[error("rank {rank} failed: {reason}")]
+    OtherRank {
+        /// The rank.
+        rank: usize,
+        /// Its error.
+        reason: String,
+    },
+    /// Ranks that must agree differ.
+    #[error(
+        "{what} of rank {rank} differ from rank 0's; all ranks need the same program, config and data, and a run directory on \
+         a file system that they share"
+    )]
+    RanksDiffer {
+        /// What differs.
+        what: &'static str,
+        /// The first rank that differs.
+        rank: usize,
+    },
+    /// A launcher started several processes that cannot be connected.
+    #[error("a launcher started {num_ranks} processes, and {reason}")]
+    NoMpi {
+        /// Number of processes.
+        num_ranks: usize,
+        /// Why they are not connected, and the remedy.
+        reason: String,
+    },
     /// A device failed.
     #[error("the device failed: {reason}")]
     Device {

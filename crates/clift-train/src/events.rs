@@ -3,8 +3,10 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_eval::Progress;
+use clift_eval::{EvalError, Process, Progress, SharedScenes};
 use serde::{Deserialize, Serialize};
+
+use crate::distributed::ranks::Ranks;
 
 /// One part of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
@@ -127,6 +129,8 @@ impl<F: FnMut(&Event)> Sink for F {
 pub(crate) struct EvalEvents<'a> {
     pub stop: &'a AtomicBool,
     pub sink: &'a mut dyn Sink,
+    /// Ranks that share the scenes.
+    pub ranks: &'a Ranks,
     /// Whether scenes are counted: in an evaluation, not in a validation or the fit of a codec.
     pub is_stage: bool,
 }
@@ -151,5 +155,13 @@ impl Progress for EvalEvents<'_> {
 
     fn is_interrupted(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
+    }
+
+    fn process(&self) -> Process {
+        Process { rank: self.ranks.rank(), count: self.ranks.num_ranks() }
+    }
+
+    fn gather(&mut self, own: SharedScenes) -> Result<Vec<SharedScenes>, EvalError> {
+        self.ranks.gather(own).map_err(|error| EvalError::OtherProcess { reason: error.to_string() })
     }
 }

@@ -22,6 +22,7 @@
 mod checkpoint;
 mod cluster_cache;
 mod config;
+mod distributed;
 mod error;
 mod events;
 mod footprint;
@@ -40,12 +41,19 @@ pub use config::config::{
 };
 pub use config::overrides::Override;
 pub use config::parse::{ConfigError, parse_config, read_checked_config, read_config};
+// Ranks of a run
+pub use distributed::communicator::Communicator;
+pub use distributed::launch::Launched;
+pub use distributed::machine::RankPlace;
+pub use distributed::parts::BatchParts;
+pub use distributed::ranks::Ranks;
 // A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
 pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;
-pub use run::run::{Run, RunOptions};
+pub use run::run::Run;
+pub use run::run_file::RunOptions;
 pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 pub use token_codec::fit_token_codec;

@@ -9,6 +9,7 @@ use clift_eval::{CodecOptions, EvalConfig, EvalError, EvalFrames, FittedCodec, e
 use clift_model::{Grouping, ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
+use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{EvalEvents, Event, Sink};
 
@@ -39,7 +40,7 @@ pub fn fit_token_codec(
         kmeans: config.clusters.kmeans.clone(),
         seed: derive_seed(config.seed, "codec"),
     };
-    let mut progress = EvalEvents { stop, sink, is_stage: false };
+    let mut progress = EvalEvents { stop, sink, ranks: &Ranks::single(), is_stage: false };
     let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
     fitted.codec.write(&TokenCodec::path_of(weights))?;
     Ok(fitted)

@@ -55,7 +55,10 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
 fn train_exit_code(error: &TrainError) -> u8 {
     match error {
         TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
-        TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. } => USAGE,
+        TrainError::BadConfig { .. }
+        | TrainError::OtherRun { .. }
+        | TrainError::Missing { .. }
+        | TrainError::NoMpi { .. } => USAGE,
         TrainError::Eval(error) => eval_exit_code(error),
         TrainError::Data(error) => data_exit_code(error),
         TrainError::Model(error) => model_exit_code(error),

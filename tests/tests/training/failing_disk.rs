@@ -1,9 +1,8 @@
 //! Full disks, unwritable folders, vanished data: the run ends with a message and can be resumed.
 
-use std::path::Path;
 use std::process::Command;
 
-use crate::support::{BINARY, Place, STAGE_1, Shared, finish, start};
+use crate::support::{BINARY, Place, STAGE_1, Shared, SmallDisk, finish, start};
 
 /// Stage 1 of 24 steps, with a checkpoint at step 12.
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
@@ -36,24 +35,6 @@ fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     place.assert_names_last_checkpoint("run", 12, &message);
     place.train("run", &HALF).ok();
     place.assert_same_run("run", "whole");
-}
-
-/// A small file system in memory, unmounted when dropped; needs root.
-struct SmallDisk<'a>(&'a Path);
-
-impl<'a> SmallDisk<'a> {
-    fn mount(folder: &'a Path, kib: u64) -> Option<Self> {
-        std::fs::create_dir(folder).expect("writable");
-        let options = format!("size={kib}k");
-        let mount = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "clift-test"]).arg(folder).output();
-        mount.ok().filter(|output| output.status.success()).map(|_| Self(folder))
-    }
-}
-
-impl Drop for SmallDisk<'_> {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg(self.0).status();
-    }
 }
 
 #[test]

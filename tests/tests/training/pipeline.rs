@@ -236,3 +236,21 @@ fn runs_start_from_weights_of_other_runs() {
     assert!(!condenser("first").is_empty());
     assert_eq!(condenser("seventh"), condenser("first"));
 }
+
+#[cfg(not(feature = "mpi"))]
+#[test]
+fn several_processes_of_a_build_without_mpi_are_told_how_to_build() {
+    use std::process::Command;
+
+    use crate::support::{BINARY, finish, start};
+
+    let place = Place::new();
+    let rank = |rank: &str| {
+        let launcher = [("OMPI_COMM_WORLD_SIZE", "2"), ("OMPI_COMM_WORLD_RANK", rank)];
+        finish(start(Command::new(BINARY).envs(launcher).args(place.train_args("run", &[]))))
+    };
+    rank("0").fails_with(2, &["a launcher started 2 processes", "cargo build --release --features mpi"]);
+    let other = rank("1");
+    assert_eq!((other.code, other.stderr.as_str()), (Some(2), ""), "one rank prints");
+    assert!(!place.at("run").exists());
+}

@@ -8,16 +8,30 @@ use clift_data::SourceKind;
 use clift_eval::available_bytes;
 use clift_model::{DeviceName, ModelConfig, Parameters, Part, SceneSizes};
 use clift_train::{
-    Config, Stage, StageSettings, TrainError, cluster_counts, eval_sizes, num_tokens, peak_bytes, possible_sizes,
-    scene_with_all_tokens, scene_with_stored_tokens, typical_sizes,
+    BatchParts, Config, Stage, StageSettings, TrainError, cluster_counts, eval_sizes, num_tokens, peak_bytes,
+    possible_sizes, scene_with_all_tokens, scene_with_stored_tokens, typical_sizes,
 };
 use serde::Serialize;
 
+use crate::allreduce::sent_bytes;
 use crate::plan::calibration::{InferenceRates, inference_rates, loading_s, part_macs, update_macs, update_rates};
 
-/// Estimate of a run.
+/// How a run is planned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PlanOptions {
+    /// Whether a short calibration on the device gives times.
+    pub is_timed: bool,
+    /// Ranks that share batches and scenes, one device each.
+    pub num_ranks: usize,
+    /// Bytes per second that a rank sends in the sum over ranks; `None` leaves its time out.
+    pub sent_bytes_per_s: Option<f64>,
+}
+
+/// Estimate of a run, for one of its ranks.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Plan {
+    /// Number of ranks.
+    pub num_ranks: usize,
     /// Device of the tensors.
     pub device: DeviceName,
     /// Threads of the CPU devices.
@@ -39,7 +53,7 @@ pub struct PartPlan {
     pub part: &'static str,
     /// Counted unit: `step` or `scene`.
     pub unit: &'static str,
-    /// Number of units; `None` if it depends on the data.
+    /// Number of units; scenes of one rank. `None` if it depends on the data.
     pub count: Option<u64>,
     /// Number of trained parameters.
     pub trained_parameters: u64,
@@ -47,6 +61,8 @@ pub struct PartPlan {
     pub gmacs: f64,
     /// Peak memory of the process.
     pub peak_bytes: u64,
+    /// Bytes that a rank sends per step to sum the gradients.
+    pub sent_bytes: u64,
     /// Mean seconds of a unit on the device; `None` without timing.
     pub compute_s: Option<f64>,
     /// Mean number of busy threads of this process during an update.
@@ -64,21 +80,24 @@ impl PartPlan {
     }
 }
 
-/// Estimates a run of `config`; with `is_timed` after a short calibration on its device.
+/// Estimates a run of `config`, for the rank with the most work.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for impossible values, and those of the device.
-pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
+pub fn plan(config: &Config, options: &PlanOptions) -> Result<Plan, TrainError> {
     check_plan(config)?;
+    let PlanOptions { is_timed, num_ranks, sent_bytes_per_s } = *options;
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
+    let share = |part: PartPlan| PartPlan { count: part.count.map(|count| count.div_ceil(num_ranks as u64)), ..part };
     let part = |part| match part {
-        Stage::Stage1 | Stage::Stage2 => update(config, part, &parameters, is_timed),
-        Stage::Clusters => clusters(config, is_timed),
-        Stage::Eval => evaluation(config, is_timed),
+        Stage::Stage1 | Stage::Stage2 => update(config, part, &parameters, options),
+        Stage::Clusters => clusters(config, is_timed).map(share),
+        Stage::Eval => evaluation(config, is_timed).map(share),
     };
     let parts = config.parts().into_iter().map(part).collect::<Result<Vec<_>, _>>()?;
     let mut plan = Plan {
+        num_ranks,
         device: config.device,
         threads: rayon::current_num_threads(),
         parameters,
@@ -88,26 +107,35 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
     };
     let per_view_s = if is_timed { loading_s(config) } else { None };
     for part in &mut plan.parts {
-        let (num_views, num_threads) = views_and_threads(config, part.part);
+        let (num_views, num_threads) = views_and_threads(config, part.part, num_ranks);
         part.loading_s = per_view_s.map(|seconds| seconds * num_views);
         part.seconds = part.compute_s.map(|compute| {
             let is_cpu = matches!(config.device, DeviceName::Flex | DeviceName::Ndarray);
             let shared =
                 part.busy_threads.filter(|_| is_cpu).map(|busy| SharedCores { cores: plan.threads as f64, busy });
-            seconds_per_unit(compute, part.loading_s.unwrap_or(0.0), num_threads, shared)
+            let sum_s = sent_bytes_per_s.map_or(0.0, |rate| part.sent_bytes as f64 / rate);
+            seconds_per_unit(compute + sum_s, part.loading_s.unwrap_or(0.0), num_threads, shared)
         });
     }
     Ok(plan)
 }
 
+/// Returns the most scenes of a batch that a rank works off, and the batch's parts.
+fn scenes_of_rank(config: &Config, stage: Stage, num_ranks: usize) -> (usize, BatchParts) {
+    let StageSettings { batch_size, accumulate, .. } = config.stage(stage);
+    let parts = |rank| BatchParts::of_rank(batch_size, accumulate, rank, num_ranks);
+    let most = (0..num_ranks).map(|rank| parts(rank).slots().count()).max().unwrap_or_default();
+    (most, parts(0))
+}
+
 /// Returns the mean number of views that a unit of a part reads, and the number of threads that read ahead.
-fn views_and_threads(config: &Config, part: &str) -> (f64, usize) {
+fn views_and_threads(config: &Config, part: &str, num_ranks: usize) -> (f64, usize) {
     let views = &config.data.views;
     let contexts = f64::midpoint(views.min_context as f64, views.max_context as f64);
-    let batch = |batch_size: usize| batch_size as f64 * (contexts + views.num_targets as f64);
+    let batch = |stage| scenes_of_rank(config, stage, num_ranks).0 as f64 * (contexts + views.num_targets as f64);
     match part {
-        "stage1" => (batch(config.stage1.batch_size), config.data.num_threads),
-        "stage2" => (batch(config.stage2.batch_size), config.data.num_threads),
+        "stage1" => (batch(Stage::Stage1), config.data.num_threads),
+        "stage2" => (batch(Stage::Stage2), config.data.num_threads),
         "clusters" => (contexts, 0),
         _ => ((config.eval.num_context + config.eval.num_targets) as f64, 0),
     }
@@ -155,8 +183,14 @@ pub fn missing_weights(config: &Config) -> Vec<String> {
     perceptual.into_iter().chain(lpips).collect()
 }
 
-fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
-    let StageSettings { steps, batch_size, .. } = config.stage(stage);
+fn update(
+    config: &Config,
+    stage: Stage,
+    parameters: &Parameters,
+    options: &PlanOptions,
+) -> Result<PartPlan, TrainError> {
+    let PlanOptions { is_timed, num_ranks, .. } = *options;
+    let (batch_size, parts) = scenes_of_rank(config, stage, num_ranks);
     let all = possible_sizes(config, stage)?;
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
@@ -166,8 +200,25 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     let compute_s = rates
         .map(|rates| macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_image);
     let busy_threads = rates.map(|rates| rates.busy);
-    let part = untimed(config, stage, macs)?;
-    Ok(PartPlan { unit: "step", count: Some(steps), trained_parameters, compute_s, busy_threads, ..part })
+    let mut of_rank = config.clone();
+    of_rank.set_accumulate(stage, parts.num_parts());
+    let mut part = untimed(&of_rank, stage, macs)?;
+    if num_ranks > 1 {
+        part.peak_bytes += sum_bytes(trained_parameters, num_ranks);
+        // A part of every round is sent to the ranks that add it up, and once the sum to the others.
+        let both = sent_bytes(trained_parameters, num_ranks);
+        part.sent_bytes = both / 2 * (parts.num_rounds() as u64 + 1);
+    }
+    let count = Some(config.stage(stage).steps);
+    Ok(PartPlan { unit: "step", count, trained_parameters, compute_s, busy_threads, ..part })
+}
+
+/// Returns the memory of a sum over ranks: the gradients in one vector, those received, the own range, and the blocks that
+/// are copied from the device.
+fn sum_bytes(num_values: u64, num_ranks: usize) -> u64 {
+    const MAX_COPIED: u64 = 2 * (64 << 20);
+    let bytes = 4 * num_values;
+    2 * bytes + bytes / num_ranks as u64 + MAX_COPIED.min(2 * bytes)
 }
 
 fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
@@ -240,6 +291,7 @@ fn untimed(config: &Config, part: Stage, macs: f64) -> Result<PartPlan, TrainErr
         trained_parameters: 0,
         gmacs: macs / 1e9,
         peak_bytes: peak_bytes(config, part)?,
+        sent_bytes: 0,
         compute_s: None,
         busy_threads: None,
         loading_s: None,
@@ -280,11 +332,32 @@ mod tests {
         config
     }
 
+    const UNTIMED: PlanOptions = PlanOptions { is_timed: false, num_ranks: 1, sent_bytes_per_s: None };
+
+    #[test]
+    fn ranks_share_batches_and_scenes() {
+        let mut config = config();
+        (config.stage1.batch_size, config.stage1.accumulate) = (16, 4);
+        (config.clusters.num_scenes, config.clusters.num_passes) = (90, 1);
+        let of = |num_ranks| plan(&config, &PlanOptions { num_ranks, ..UNTIMED }).expect("valid");
+        let [one, two, eight] = [1, 2, 8].map(of);
+        let stage1 = |plan: &Plan| plan.parts[0].clone();
+        assert_eq!((stage1(&one).sent_bytes, eight.num_ranks), (0, 8));
+        let ratio = stage1(&one).gmacs / stage1(&eight).gmacs;
+        assert!((ratio - 8.0).abs() < 1e-9, "{ratio}");
+        assert!(stage1(&eight).peak_bytes < stage1(&one).peak_bytes, "parts of two scenes instead of four");
+        let bytes = 4 * stage1(&one).trained_parameters;
+        // Two rounds and the sums; one round and the sums.
+        assert_eq!([stage1(&two).sent_bytes, stage1(&eight).sent_bytes], [3 * (bytes / 2), 2 * (bytes * 7 / 8)]);
+        assert_eq!([&one, &two, &eight].map(|plan| plan.parts[1].count), [Some(90), Some(45), Some(12)]);
+        assert_eq!(stage1(&eight).count, stage1(&one).count);
+    }
+
     #[test]
     fn untimed_plan_has_all_parts_without_data() {
         let mut config = config();
         config.data.source = SourceKind::Chunks;
-        let plan = plan(&config, false).expect("valid");
+        let plan = plan(&config, &UNTIMED).expect("valid");
         assert_eq!(
             plan.parts.iter().map(|part| part.part).collect::<Vec<_>>(),
             ["stage1", "clusters", "stage2", "eval"]
@@ -332,7 +405,7 @@ mod tests {
         for device in [DeviceName::Flex, DeviceName::Ndarray] {
             let config = Config { device, ..config.clone() };
             assert_eq!(missing_weights(&config).len(), 2);
-            let plan = plan(&config, true).expect("runs without weight files");
+            let plan = plan(&config, &PlanOptions { is_timed: true, ..UNTIMED }).expect("runs without weight files");
             for part in plan.parts {
                 let seconds = part.seconds.expect("timed");
                 assert!(seconds > 0.0 && seconds < 60.0, "{device} {}: {seconds}", part.part);

@@ -79,21 +79,19 @@ impl TrainingClips {
     /// # Errors
     /// [`DataError::NoUsableScene`] after 16 attempts and 64 different scenes (all scenes of a smaller source).
     pub fn batch(&self, step: u64) -> Result<ClipBatch, DataError> {
-        let num_context = self.sampler.num_context(self.seed, step);
         let mut batch = ClipBatch { step, clips: Vec::new(), skipped: Vec::new() };
         for slot in 0..self.order.batch_size() {
-            batch.clips.push(self.fill_slot(step, slot, num_context, &mut batch.skipped)?);
+            batch.clips.push(self.slot(step, slot, &mut batch.skipped)?);
         }
         Ok(batch)
     }
 
-    fn fill_slot(
-        &self,
-        step: u64,
-        slot: usize,
-        num_context: usize,
-        skipped: &mut Vec<SkippedScene>,
-    ) -> Result<Clip, DataError> {
+    /// Reads one slot of the batch of `step`, and appends the scenes that were skipped for it.
+    ///
+    /// # Errors
+    /// As [`TrainingClips::batch`].
+    pub fn slot(&self, step: u64, slot: usize, skipped: &mut Vec<SkippedScene>) -> Result<Clip, DataError> {
+        let num_context = self.sampler.num_context(self.seed, step);
         let filler = SlotFiller {
             min_attempts: MIN_ATTEMPTS,
             min_scenes: self.source.num_scenes().min(MIN_SCENES_TRIED),

@@ -13,7 +13,7 @@ use clift_model::{
 use rand::RngExt;
 
 use crate::error::EvalError;
-use crate::evaluator::evaluator::Progress;
+use crate::evaluator::progress::Progress;
 use crate::sweep::compressed_tokens::{host_values, with_values};
 use crate::upload::{upload_cameras, upload_views};
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, EvaluationItem, SkipReport, plural, replace_file};
+use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural, replace_file};
 use clift_model::{ModelError, TokenCoding};
 
 use crate::config::eval_config::EvalConfig;
@@ -11,6 +11,7 @@ use crate::config::method::Method;
 use crate::config::split::{EvalFrames, EvalSplit};
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
+use crate::evaluator::progress::{Progress, SharedScenes};
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
@@ -75,7 +76,7 @@ impl Evaluator {
         (text, self.split.warning().map(str::to_owned).into_iter().chain(context_targets_note(num_given)).collect())
     }
 
-    /// Measures every scene and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
+    /// Measures every scene, shared with other processes by `progress`, the first of which writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
     /// contact sheets to `folder`. Scores the images of `external_methods` too. The report has the curves of `training`.
     ///
     /// # Errors
@@ -101,13 +102,14 @@ impl Evaluator {
             ..self.sweep.clone()
         };
         progress.done(0, self.items.len());
-        let sheets = Sheets::new(folder)?;
+        let is_writer = progress.process().rank == 0;
+        let sheets = is_writer.then(|| Sheets::new(folder)).transpose()?;
         let mut figures = Vec::new();
         let mut keep_figures = |key: &str, scene: SceneFigures| {
             if figures.len() < MAX_FIGURES {
                 figures.push(scene.figure);
             }
-            sheets.add(&scene.contact_sheet, key)
+            sheets.as_ref().map_or(Ok(()), |sheets| sheets.add(&scene.contact_sheet, key))
         };
         let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.eval.num_sheets };
         let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
@@ -122,6 +124,7 @@ impl Evaluator {
         for external in external_methods {
             self.require_images(external, &summary)?;
         }
+        let Some(sheets) = sheets else { return Ok(summary) };
         sheets.keep()?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
@@ -135,8 +138,9 @@ impl Evaluator {
         Ok(summary)
     }
 
-    /// Measures the first scenes with `sweep`, and passes figures of the first scenes to `keep_figures`. Returns the
-    /// metrics, and the scenes whose views could not be chosen or read.
+    /// Measures the first scenes with `sweep`, shared with other processes by `progress`, and passes figures of the first
+    /// scenes to `keep_figures` of the first process. Returns the metrics, and the scenes whose views could not be chosen or
+    /// read, of all processes.
     ///
     /// # Errors
     /// [`EvalError::Interrupted`] when `progress` requests a stop; as [`evaluate_scene`] and `keep_figures`.
@@ -153,26 +157,52 @@ impl Evaluator {
         measured.split = Some(self.split);
         measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
+        let process = progress.process();
+        let mut own = SharedScenes::default();
         for (i, item) in self.items.iter().take(total).enumerate() {
             if progress.is_interrupted() {
-                return Err(EvalError::Interrupted { done: i, total });
+                own.interrupted_at = Some(i);
+                break;
+            }
+            if !process.measures(i, limits.num_figures) {
+                continue;
             }
             let key = self.reader.source.key(item.scene);
             match self.reader.read(item.scene, &item.views) {
                 Ok(clip) => {
                     let keep_images = i < limits.num_figures;
-                    if let Some(results) = evaluate_scene(models, &clip, sweep, keep_images, &mut measured)? {
+                    if let Some(results) = evaluate_scene(models, &clip, sweep, keep_images, &mut own.results)? {
                         keep_figures(key, SceneFigures::new(&clip, &results, sweep.model.patch_size)?)?;
                     }
                 }
                 Err(error) => {
                     let reason = error.to_string();
-                    measured.skipped.insert(key.into());
                     progress.skipped(key, &reason);
-                    skip_report.skip(key, reason);
+                    own.skipped.push((i, SkippedScene { key: key.into(), reason }));
                 }
             }
             progress.done(i + 1, total);
+        }
+        let mut skipped = Vec::new();
+        for (rank, part) in progress.gather(own)?.into_iter().enumerate() {
+            if let Some(done) = part.interrupted_at {
+                return Err(EvalError::Interrupted { done, total });
+            }
+            measured.merge(part.results)?;
+            for (i, skip) in part.skipped {
+                if rank != process.rank {
+                    progress.skipped(&skip.key, &skip.reason);
+                }
+                skipped.push((i, skip));
+            }
+        }
+        skipped.sort_by_key(|(i, _)| *i);
+        for (_, SkippedScene { key, reason }) in skipped {
+            measured.skipped.insert(key.clone());
+            skip_report.skip(key, reason);
+        }
+        if process.count > 1 {
+            progress.done(total, total);
         }
         Ok((measured, skip_report))
     }
@@ -247,21 +277,6 @@ impl Evaluator {
         let (value, fix) = (method.name().into(), fix.into());
         Err(ModelError::BadConfig { key: "eval.variants", value, fix }.into())
     }
-}
-
-/// Receiver of progress, with the request to stop.
-pub trait Progress {
-    /// Reports that `scenes` of `total` are done. The first call has 0 scenes.
-    fn done(&mut self, scenes: usize, total: usize);
-
-    /// Reports a line of text.
-    fn note(&mut self, text: &str);
-
-    /// Reports a skipped scene.
-    fn skipped(&mut self, key: &str, reason: &str);
-
-    /// Returns whether to stop the evaluation.
-    fn is_interrupted(&self) -> bool;
 }
 
 /// Numbers of measured scenes and of scenes with figures.

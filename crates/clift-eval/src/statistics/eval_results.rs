@@ -24,7 +24,7 @@ pub struct NotMeasured {
 pub type SceneViews = BTreeMap<String, BTreeMap<usize, ViewMetrics>>;
 
 /// The results of an evaluation. Output files do not depend on the order in which views are added.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct EvalResults {
     views: BTreeMap<EvalKey, SceneViews>,
     /// Cost of every key of which a warm-up view was rendered, and of external methods.
@@ -69,6 +69,34 @@ impl EvalResults {
         self.of(key).and_then(|scenes| scenes.get(scene)).is_some_and(|frames| frames.contains_key(&frame))
     }
 
+    /// Adds the views that another process has measured of other scenes.
+    ///
+    /// # Errors
+    /// As [`EvalResults::add`].
+    pub(crate) fn merge(&mut self, other: Self) -> Result<(), EvalError> {
+        for (key, scenes) in other.views {
+            for (scene, frames) in scenes {
+                frames.into_iter().try_for_each(|(frame, view)| self.add(&scene, frame, key, view))?;
+            }
+        }
+        for (key, cost) in other.costs {
+            self.costs.entry(key).or_insert(cost);
+        }
+        for (key, sizes) in other.scene_bytes {
+            for bytes in sizes {
+                self.add_scene_bytes(key, bytes);
+            }
+        }
+        for (method, images) in other.missing {
+            self.missing.entry(method).or_default().extend(images);
+        }
+        self.skipped.extend(other.skipped);
+        self.not_measured.extend(other.not_measured);
+        self.selection = self.selection.or(other.selection);
+        self.context_targets.extend(other.context_targets);
+        Ok(())
+    }
+
     /// Iterates over the views of every key, in the order of keys.
     pub fn views(&self) -> impl Iterator<Item = (EvalKey, &SceneViews)> {
         self.views.iter().map(|(key, views)| (*key, views))
@@ -102,6 +130,21 @@ impl EvalResults {
 mod tests {
     use super::*;
     use crate::testing::CLIFT;
+
+    #[test]
+    fn parts_of_several_processes_are_merged() {
+        let part = |scene: &str, bytes| {
+            let mut part = EvalResults::default();
+            part.add(scene, 1, CLIFT, ViewMetrics::quality(f64::INFINITY, None)).unwrap();
+            part.add_scene_bytes(CLIFT, bytes);
+            part
+        };
+        let mut whole = part("attic", 10);
+        whole.merge(part("cellar", 20)).unwrap();
+        assert_eq!(whole.of(CLIFT).unwrap().len(), 2);
+        assert_eq!(whole.costs[&CLIFT].scene_bytes, Some(15));
+        assert!(whole.merge(part("attic", 10)).is_err(), "a scene twice");
+    }
 
     #[test]
     fn duplicate_views_are_refused() {

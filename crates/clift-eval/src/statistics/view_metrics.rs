@@ -54,7 +54,7 @@ pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Met
 pub const PSNR_CAP_DB: f64 = 100.0;
 
 /// The metrics of one view; `None` was not measured.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewMetrics {
     /// Peak signal-to-noise ratio in dB; infinite for an identical image.
     pub psnr: f64,

@@ -61,6 +61,18 @@ impl DeviceName {
             Self::Wgpu => open_wgpu(),
         }
     }
+
+    /// Opens the device of the `index`-th of several processes on a host, and returns the name of its adapter: on wgpu the
+    /// adapters of the first kind in turn, unless the environment variable selects one.
+    ///
+    /// # Errors
+    /// As [`DeviceName::open`].
+    pub fn open_nth(self, index: usize) -> Result<(Device, Option<String>), ModelError> {
+        match self {
+            Self::Flex | Self::Ndarray => Ok((self.open()?, None)),
+            Self::Wgpu => open_nth_wgpu(index),
+        }
+    }
 }
 
 impl std::str::FromStr for DeviceName {
@@ -82,6 +94,33 @@ fn open_wgpu() -> Result<Device, ModelError> {
                  or choose `flex` (`--device flex`)"
             .into(),
     })
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn open_nth_wgpu(_index: usize) -> Result<(Device, Option<String>), ModelError> {
+    Ok((open_wgpu()?, None))
+}
+
+#[cfg(feature = "wgpu")]
+fn open_nth_wgpu(index: usize) -> Result<(Device, Option<String>), ModelError> {
+    use crate::device::adapter::{ADAPTER_VARIABLE, Adapter, adapters};
+    use burn::tensor::DeviceKind;
+    let first = open_wgpu()?;
+    let adapters = std::panic::catch_unwind(adapters).unwrap_or_default();
+    let name = |adapter: &Adapter| Some(format!("wgpu with {} ({})", adapter.name, adapter.selector));
+    let used = adapters.iter().find(|adapter| adapter.is_used);
+    let Some(used) = used.filter(|_| std::env::var_os(ADAPTER_VARIABLE).is_none()) else {
+        return Ok((first, used.and_then(name)));
+    };
+    let same: Vec<&Adapter> = adapters.iter().filter(|adapter| adapter.kind == used.kind).collect();
+    let number = index % same.len();
+    let kind = match used.kind {
+        "discrete GPU" => DeviceKind::DiscreteGpu(number),
+        "integrated GPU" => DeviceKind::IntegratedGpu(number),
+        "virtual GPU" => DeviceKind::VirtualGpu(number),
+        _ => return Ok((first, name(used))),
+    };
+    Ok((Device::wgpu(kind), name(same[number])))
 }
 
 #[cfg(feature = "wgpu")]

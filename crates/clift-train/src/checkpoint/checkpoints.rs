@@ -101,18 +101,25 @@ impl Checkpoints {
     /// # Errors
     /// [`TrainError::Damaged`] for a damaged checkpoint.
     pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
-        let mut steps = self.steps()?;
-        let Some(step) = steps.pop() else { return Ok(None) };
+        let Some(step) = self.newest_step()? else { return Ok(None) };
         // Each save removes unfinished saves, but a finished stage makes no further save.
         self.remove_unfinished()?;
-        let loaded = load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
-            let fix = match steps.last() {
-                Some(older) => format!("remove {} to resume from {}", name_of(step), name_of(*older)),
+        self.load(step, train_state).map(Some)
+    }
+
+    /// Loads the checkpoint of a step into `train_state`, and changes no file.
+    ///
+    /// # Errors
+    /// [`TrainError::Damaged`] for a damaged checkpoint.
+    pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<Progress, TrainError> {
+        load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
+            let older = self.steps().unwrap_or_default().into_iter().rfind(|older| *older < step);
+            let fix = match older {
+                Some(older) => format!("remove {} to resume from {}", name_of(step), name_of(older)),
                 None => "the stage has no other; start a new run with --fresh".into(),
             };
             TrainError::Damaged { source: Box::new(source), fix }
-        });
-        loaded.map(Some)
+        })
     }
 
     /// Returns the path of the newest checkpoint.

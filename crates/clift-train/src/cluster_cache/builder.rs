@@ -13,6 +13,7 @@ use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
 use crate::cluster_cache::cache::{ClusterCache, VERSION, settings};
 use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
 use crate::config::config::{ClustersConfig, Config};
+use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 
@@ -25,44 +26,72 @@ pub struct ClusterBuilder<'a> {
     pub encoder: &'a Encoder,
     pub encoder_hash: &'a str,
     pub device: &'a Device,
+    /// Ranks that share the scenes.
+    pub ranks: &'a Ranks,
 }
+
+/// The outcome of a context set: its frames and clusters, or why the scene was skipped.
+type Clustered = Result<(Vec<usize>, Vec<u32>, Vec<u32>), String>;
 
 impl ClusterBuilder<'_> {
     /// Clusters every training scene `num_passes` times, each time with one context set and one count of the grid, and opens
     /// the cache. Resumes an interrupted build with the same encoder and settings; the bytes do not depend on interruptions.
     /// The cache is written to a temporary folder, which is then renamed. Scenes that cannot be used are skipped.
     pub fn build(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
-        let Self { config, reader, encoder_hash, .. } = *self;
-        let cache_key = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
-        let mut log = ResumeLog::open(&folder.with_extension("tmp"), cache_key)?;
+        let Self { config, reader, encoder_hash, ranks, .. } = *self;
+        // Rank 0 alone writes.
+        let mut log = None;
+        let done = ranks.from_root(|| {
+            let cache_key = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
+            let opened = ResumeLog::open(&folder.with_extension("tmp"), cache_key)?;
+            Ok(log.insert(opened).num_sets())
+        })?;
 
         let total = reader.source.num_scenes();
         let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
         let total_sets = (config.clusters.num_passes * num_scenes) as u64;
         let started = std::time::Instant::now();
-        let done = log.num_sets();
         sink.event(&Event::StageStarted { stage: Stage::Clusters, done, num_steps: total_sets });
-        for set in done..total_sets {
-            let (pass, scene) = (set / num_scenes as u64, set as usize % num_scenes);
-            let key = reader.source.key(scene);
-            match self.cluster_scene(pass, scene) {
-                Ok((context, clusters)) => log.add(key, context, &clusters)?,
-                // A failing disk is not a problem of the scene.
-                Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => {
-                    let reason = error.to_string();
-                    sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
-                    log.skip(key, &reason)?;
+        let of_set = |set: u64| (set / num_scenes as u64, set as usize % num_scenes);
+        for first in (done..total_sets).step_by(ranks.num_ranks()) {
+            let set = first + ranks.rank() as u64;
+            let own = (set < total_sets).then(|| self.cluster_or_skip(of_set(set))).transpose()?;
+            let all = ranks.gather((own, stop.load(Ordering::Relaxed)))?;
+            let is_stopped = all.iter().any(|(_, is_stopped)| *is_stopped);
+            let sets = all.into_iter().filter_map(|(set, _)| set);
+            for (set, outcome) in (first..).zip(sets) {
+                if let Some(log) = &mut log {
+                    let key = reader.source.key(of_set(set).1);
+                    match outcome {
+                        Ok((context, tokens, centroids)) => {
+                            log.add(key, context, &SceneClusters::new(tokens, centroids)?)?;
+                        }
+                        Err(reason) => {
+                            sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
+                            log.skip(key, &reason)?;
+                        }
+                    }
                 }
-                Err(other) => return Err(other),
+                sink.event(&Event::Progress { stage: Stage::Clusters, done: set + 1, total: total_sets });
             }
-            sink.event(&Event::Progress { stage: Stage::Clusters, done: set + 1, total: total_sets });
-            if stop.load(Ordering::Relaxed) {
-                return Err(TrainError::Interrupted { step: set + 1 });
+            if is_stopped {
+                return Err(TrainError::Interrupted { step: total_sets.min(first + ranks.num_ranks() as u64) });
             }
         }
         sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
-        log.publish(folder, num_scenes)?;
+        ranks.from_root(|| log.take().map_or(Ok(()), |log| log.publish(folder, num_scenes)))?;
         ClusterCache::open(folder, config, encoder_hash)
+    }
+
+    fn cluster_or_skip(&self, (pass, scene): (u64, usize)) -> Result<Clustered, TrainError> {
+        match self.cluster_scene(pass, scene) {
+            Ok((context, clusters)) => {
+                Ok(Ok((context, clusters.assignment().to_vec(), clusters.centroid_index().to_vec())))
+            }
+            // A failing disk is not a problem of the scene.
+            Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => Ok(Err(error.to_string())),
+            Err(other) => Err(other),
+        }
     }
 
     fn cluster_scene(&self, pass: u64, scene: usize) -> Result<(Vec<usize>, SceneClusters), TrainError> {

@@ -206,7 +206,7 @@ pub struct Stage1Config {
     pub steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
-    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients.
+    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them.
     pub accumulate: usize,
     /// Smallest and largest share of the tokens that the renderer receives; the share is sampled every step.
     pub keep_tokens: [f64; 2],
@@ -268,7 +268,7 @@ pub struct Stage2Config {
     pub steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
-    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients.
+    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them.
     pub accumulate: usize,
     /// Learning rate of the renderer, as a factor of the condenser's.
     pub renderer_lr_factor: f64,

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_eval::Summary;
+
 use crate::error::{TrainError, bad};
 use crate::events::Sink;
 use crate::run::lock::{LockedFolder, RunLock};
@@ -13,7 +15,7 @@ pub(crate) const SUMMARY: &str = "summary.json";
 #[derive(Debug)]
 pub struct EvalFolder {
     path: PathBuf,
-    _lock: RunLock,
+    _lock: Option<RunLock>,
 }
 
 impl EvalFolder {
@@ -29,7 +31,12 @@ impl EvalFolder {
             let fix = "the folder holds an evaluation; replace it with --force, or set another --out";
             return Err(bad("--out", path.display(), fix));
         }
-        Ok(Self { path: path.into(), _lock: lock })
+        Ok(Self { path: path.into(), _lock: Some(lock) })
+    }
+
+    /// Returns the folder of a rank that does not write.
+    pub(crate) fn unlocked(path: PathBuf) -> Self {
+        Self { path, _lock: None }
     }
 
     /// Returns the path of the folder.
@@ -42,6 +49,12 @@ impl EvalFolder {
         let real = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.into());
         real(&self.path).starts_with(real(folder))
     }
+}
+
+/// Reads the summary of an evaluation.
+pub(crate) fn read_summary(path: &Path) -> Result<Summary, TrainError> {
+    let text = std::fs::read(path).map_err(TrainError::io("reading the evaluation", path))?;
+    serde_json::from_slice(&text).map_err(TrainError::bad_file("evaluation", path))
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@ use clift_eval::{EvalFrames, EvalModels, Method, Summary};
 use clift_model::{ModelError, ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
+use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::run::validation::{EvalRequest, Validation};
@@ -63,7 +64,7 @@ pub fn evaluate_model(
     let frames = EvalFrames::new(&opened, split, 0, false);
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     let validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
-    validation.evaluate(&models, request, stop, sink)
+    validation.evaluate(&models, request, &Ranks::single(), stop, sink)
 }
 
 /// Opens the stage-2 model of the run of `config`, which must be trained on the encoder of `stage1`.

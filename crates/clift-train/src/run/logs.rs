@@ -20,6 +20,8 @@ pub struct StepLines {
     /// Opened by the first line.
     file: Option<File>,
     failure: Option<std::io::Error>,
+    /// Whether lines are dropped.
+    is_silent: bool,
 }
 
 impl StepLines {
@@ -35,12 +37,17 @@ impl StepLines {
         if path.exists() {
             truncate_after(path, stage, step)?;
         }
-        Ok(Self { path: path.to_owned(), file: None, failure: None })
+        Ok(Self { path: path.to_owned(), file: None, failure: None, is_silent: false })
+    }
+
+    /// Returns lines that are not written, of a rank other than 0.
+    fn silent() -> Self {
+        Self { path: PathBuf::new(), file: None, failure: None, is_silent: true }
     }
 
     /// Appends a line. A failure is kept for [`StepLines::check`]; later lines are not written.
     pub fn write(&mut self, line: &impl Serialize) {
-        if self.failure.is_none() {
+        if self.failure.is_none() && !self.is_silent {
             self.failure = self.try_write(line).err();
         }
     }
@@ -166,6 +173,12 @@ impl<'a> RunLog<'a> {
         // A validation after the last saved one is made again.
         let (metrics, validations) = (open("metrics.jsonl", step)?, open("validation.jsonl", validated)?);
         Ok(Self { sink, metrics, validations, bad_steps: open("bad_steps.jsonl", step)?, skips, skipped })
+    }
+
+    /// Returns a log that only passes events on, of a rank other than 0.
+    pub fn silent(sink: &'a mut dyn Sink) -> Self {
+        let [metrics, validations, bad_steps, skips] = std::array::from_fn(|_| StepLines::silent());
+        Self { sink, metrics, validations, bad_steps, skips, skipped: HashSet::new() }
     }
 
     /// Reports and logs a scene that `step` could not use, once per run.

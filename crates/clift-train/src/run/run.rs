@@ -1,15 +1,13 @@
 //! A run: its directory, resumption, and the order of its stages.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::{
-    ClipReader, OpenedSource, SceneSource, SceneSubset, Split, make_folder, open_dataset, open_training_dataset,
-    remove_leftovers,
-};
+use clift_data::{ClipReader, OpenedSource, SceneSource, SceneSubset, Split, open_dataset, open_training_dataset};
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
     Clift, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
@@ -19,35 +17,24 @@ use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_resume_log;
 use crate::config::config::Config;
+use crate::distributed::machine::open_device;
+use crate::distributed::parts::BatchParts;
+use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
-use crate::run::eval_folder::{EvalFolder, SUMMARY};
+use crate::run::eval_folder::{EvalFolder, SUMMARY, read_summary};
 use crate::run::evaluate_model::{open_lvsm, open_stage2};
 use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
-use crate::run::run_file::{RunFile, compare_settings, free_name, require_run, write_config};
+use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
 use crate::run::training_data::TrainingData;
 use crate::run::validation::{EvalRequest, Validation};
+use crate::stage::settings::StageSettings;
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
 use crate::token_codec::ensure_codec;
-
-/// Options of a run beside its config.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct RunOptions {
-    /// Run only this stage.
-    pub only: Option<Stage>,
-    /// Train and evaluate on this number of training scenes.
-    pub overfit: Option<usize>,
-    /// Start a new run; the existing run directory is renamed.
-    pub fresh: bool,
-    /// Allow larger step counts than those of the existing run.
-    pub extend: bool,
-}
-
-const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
 
 /// An open run.
 pub struct Run {
@@ -56,8 +43,9 @@ pub struct Run {
     device: Device,
     /// Whether `config` reads the data set that the run was trained on.
     is_training_data: bool,
-    /// `None` for a run opened for evaluation.
+    /// `None` for a run opened for evaluation, and on ranks other than 0.
     lock: Option<RunLock>,
+    ranks: Rc<Ranks>,
 }
 
 impl Run {
@@ -67,13 +55,29 @@ impl Run {
     /// # Errors
     /// [`TrainError::OtherRun`] if the directory contains a run with other settings, [`TrainError::Locked`] if another process
     /// uses it, and those of config, device and disk.
-    pub fn open(mut config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+    pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+        Self::open_on(Rc::new(Ranks::single()), config, options, sink)
+    }
+
+    /// Opens the run directory of a config on several ranks. All ranks read the directory; rank 0 writes to it.
+    ///
+    /// # Errors
+    /// As [`Run::open`], and those of the other ranks.
+    pub fn open_on(
+        ranks: Rc<Ranks>,
+        mut config: Config,
+        options: &RunOptions,
+        sink: &mut dyn Sink,
+    ) -> Result<Self, TrainError> {
         if options.overfit.is_some() {
             // The training scenes themselves are evaluated.
             config.data.hold_out = 0;
         }
         config.validate()?;
-        let device = config.device.open()?;
+        let (device, places) = open_device(config.device, &ranks)?;
+        for place in places {
+            sink.event(&Event::Message(place));
+        }
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
         if let Some(only) = options.only.filter(|only| !config.stages().contains(only)) {
@@ -87,39 +91,16 @@ impl Run {
             let fix = format!("file not found; make it with `{LPIPS_COMMAND}`, or write \"\" to skip LPIPS");
             return Err(bad("eval.lpips_weights", path.display(), &fix));
         }
-        let folder = &config.run_dir;
-        if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
-            return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
-        }
-        if options.fresh && folder.exists() {
-            // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
-            drop(RunLock::take(folder, LockedFolder::Run, sink)?);
-            let moved = free_name(folder);
-            std::fs::rename(folder, &moved).map_err(TrainError::io("renaming the existing run", folder))?;
-            sink.event(&Event::Message(format!("renamed the existing run to {}", moved.display())));
-        }
-        make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
-        let lock = RunLock::take(folder, LockedFolder::Run, sink)?;
-        remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
-        // A run that failed before its first stage may get other settings.
-        let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
-        let mut file = RunFile::new(options.overfit);
-        if folder.join("config.toml").exists() && has_begun {
-            let found = RunFile::read(folder)?;
-            if !TrainingData::read(&config.run_dir)?.has_key {
-                // A run from before the key resumes with the frames that it was started with.
-                config.data.hold_out = 0;
-            }
-            let folder = &config.run_dir;
-            let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
-            file.extended = found.extended;
-            for extension in extensions {
-                file.extended.push(extension.apply(folder, sink)?);
-            }
-        }
-        file.write(folder)?;
-        write_config(&config)?;
-        Ok(Self { config, overfit: options.overfit, device, is_training_data: true, lock: Some(lock) })
+        let mut lock = None;
+        // Rank 0 alone writes, and decides which frames the run holds out.
+        config.data.hold_out = ranks.from_root(|| {
+            let (opened, hold_out) = open_folder(config.clone(), options, sink)?;
+            lock = Some(opened);
+            Ok(hold_out)
+        })?;
+        let text = toml::to_string(&config).map_err(TrainError::bad_file("config", &config.run_dir))?;
+        ranks.require_same("the configs", &text)?;
+        Ok(Self { config, overfit: options.overfit, device, is_training_data: true, lock, ranks })
     }
 
     /// Opens an existing run for evaluation.
@@ -135,11 +116,11 @@ impl Run {
         check_heads(&config.model, &config.run_dir)?;
         let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
-        Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None })
+        Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None, ranks: Ranks::single().into() })
     }
 
-    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run; the
-    /// existing one if the run was trained and evaluated before.
+    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run, on rank
+    /// 0; the existing one if the run was trained and evaluated before.
     ///
     /// # Errors
     /// [`TrainError::Missing`] if `only` is a stage whose predecessor has not run, and those of the stages.
@@ -151,18 +132,15 @@ impl Run {
     ) -> Result<Option<Summary>, TrainError> {
         let stages = self.config.stages();
         let wanted = |stage: Stage| stages.contains(&stage) && only.is_none_or(|only| only == stage);
-        let trained = [Stage::Stage1, Stage::Stage2].into_iter().filter(|stage| stages.contains(stage));
-        let is_trained = trained.into_iter().all(|stage| self.weights(stage).exists());
         let summary = self.folder("eval").join(SUMMARY);
-        if only.is_none() && is_trained && summary.exists() {
-            let run = self.config.run_dir.display();
-            sink.event(&Event::Message(format!(
-                "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
-            )));
-            let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
-            return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
+        // Rank 0 looks at the files for all.
+        let has_weights = || Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists()));
+        let [has_stage1, has_stage2] = self.ranks.from_root(has_weights)?;
+        let is_trained = has_stage1 && (has_stage2 || !stages.contains(&Stage::Stage2));
+        if self.ranks.from_root(|| Ok(only.is_none() && is_trained && summary.exists()))? {
+            return self.finished(&summary, sink);
         }
-        if !is_trained && summary.exists() {
+        if self.ranks.is_root() && !is_trained && summary.exists() {
             // Of former weights: of stage 1 alone, or before `--extend`.
             std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
         }
@@ -171,13 +149,12 @@ impl Run {
         let frames = EvalFrames::new(&opened, Split::Train, self.config.data.hold_out, true);
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
-
-        let train_stage2 = wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists();
+        let train_stage2 = wanted(Stage::Stage2) && !has_stage2;
         if train_stage2 {
             // A wrong `stage2.init_from` is found before stage 1 takes its time.
             init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?;
         }
-        let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
+        let stage1 = if wanted(Stage::Stage1) && !has_stage1 {
             self.train_stage1(&reader, &validation, stop, sink)?
         } else {
             self.load_stage1(only)?
@@ -188,16 +165,32 @@ impl Run {
                 self.train_stage2(&reader, cache, &validation, stage1, stop, sink)?;
             }
         }
-        if wanted(Stage::Stage2) {
+        if wanted(Stage::Stage2) && self.ranks.is_root() {
             ensure_codec(&self.config, &self.weights(Stage::Stage2), &self.device, (&reader, frames), stop, sink)?;
         }
         if only.is_some() {
             return Ok(None);
         }
-        require_run(&self.config.run_dir)?;
-        let folder = EvalFolder::open(&self.folder("eval"), true, sink)?;
+        // After rank 0 has fitted the codec, which all ranks read.
+        self.ranks.from_root(|| require_run(&self.config.run_dir))?;
+        let folder = self.folder("eval");
+        let folder =
+            if self.ranks.is_root() { EvalFolder::open(&folder, true, sink)? } else { EvalFolder::unlocked(folder) };
         let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
-        validation.evaluate(&self.models(sink)?, &request, stop, sink).map(Some)
+        let summary = validation.evaluate(&self.models(sink)?, &request, &self.ranks, stop, sink)?;
+        Ok(self.ranks.is_root().then_some(summary))
+    }
+
+    /// Reads the evaluation of a run without work, on rank 0.
+    fn finished(&self, summary: &Path, sink: &mut dyn Sink) -> Result<Option<Summary>, TrainError> {
+        if !self.ranks.is_root() {
+            return Ok(None);
+        }
+        let run = self.config.run_dir.display();
+        sink.event(&Event::Message(format!(
+            "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
+        )));
+        read_summary(summary).map(Some)
     }
 
     /// Evaluates the run. `beside` are other runs, evaluated on the same views: one with the same stage 1 whose stage 2 was
@@ -229,7 +222,7 @@ impl Run {
             }
             models.set_stage2(other.clusters.grouping, open_stage2(other, &models.stage1)?);
         }
-        self.validation(request.split, sink)?.evaluate(&models, request, stop, sink)
+        self.validation(request.split, sink)?.evaluate(&models, request, &self.ranks, stop, sink)
     }
 
     /// Opens the trained models of both stages, or of stage 1 only.
@@ -273,11 +266,11 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
-        let batches = Stage1Batches::new(&self.config, reader)?;
+        let batches = Stage1Batches::new(&self.config, reader, self.parts(Stage::Stage1))?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
         let start = |sink: &mut dyn Sink| init_from(self.new_model(), &self.config, Stage::Stage1, sink);
         let model = self.plan(Stage::Stage1, batches).train(start, validation, stop, sink)?;
-        save_part(&model, &Clift::stage1_part(), &self.weights(Stage::Stage1))?;
+        self.ranks.from_root(|| Ok(save_part(&model, &Clift::stage1_part(), &self.weights(Stage::Stage1))?))?;
         Ok(model)
     }
 
@@ -290,7 +283,7 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<(), TrainError> {
-        let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache))?;
+        let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache), self.parts(Stage::Stage2))?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
         // The condenser of stage 1 takes no gradient.
         let start = |sink: &mut dyn Sink| {
@@ -298,7 +291,12 @@ impl Run {
             Ok(Clift { condenser: initial.condenser, ..stage1 })
         };
         let model = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?;
-        Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
+        self.ranks.from_root(|| Ok(save_weights(&model, &self.weights(Stage::Stage2))?))
+    }
+
+    fn parts(&self, stage: Stage) -> BatchParts {
+        let StageSettings { batch_size, accumulate, .. } = self.config.stage(stage);
+        BatchParts::new(batch_size, accumulate, &self.ranks)
     }
 
     fn plan(&self, stage: Stage, batches: Arc<MakeBatch>) -> StagePlan<'_> {
@@ -308,6 +306,8 @@ impl Run {
             config: &self.config,
             folder: self.folder(stage.name()),
             device: self.device.clone().autodiff(),
+            ranks: &self.ranks,
+            parts: self.parts(stage),
         }
     }
 
@@ -321,8 +321,14 @@ impl Run {
     ) -> Result<ClusterCache, TrainError> {
         let folder = self.folder("clusters");
         let encoder_hash = &weights_hash(&model.encoder);
-        if folder.exists() {
-            remove_resume_log(&folder)?;
+        let is_built = self.ranks.from_root(|| {
+            let is_built = folder.exists();
+            if is_built {
+                remove_resume_log(&folder)?;
+            }
+            Ok(is_built)
+        })?;
+        if is_built {
             return ClusterCache::open(&folder, &self.config, encoder_hash);
         }
         if only == Some(Stage::Stage2) {
@@ -330,8 +336,8 @@ impl Run {
             return Err(TrainError::Missing { stage: "stage2", what, first: "--only clusters", path: folder });
         }
         let encoder = model.encoder.valid();
-        ClusterBuilder { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
-            .build(&folder, stop, sink)
+        let (config, device, ranks) = (&self.config, &self.device, &self.ranks);
+        ClusterBuilder { config, reader, encoder: &encoder, encoder_hash, device, ranks }.build(&folder, stop, sink)
     }
 
     fn new_model(&self) -> Clift {
@@ -365,7 +371,7 @@ impl Run {
     fn reader(&self, opened: OpenedSource, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let OpenedSource { source, report, .. } = opened;
         sink.event(&Event::Message(format!("{split}: {report}")));
-        if report.has_skips() && self.config.run_dir.is_dir() {
+        if self.ranks.is_root() && report.has_skips() && self.config.run_dir.is_dir() {
             write_skip_report(&report, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {
@@ -383,3 +389,6 @@ impl Run {
         self.folder(stage.name()).join("model.safetensors")
     }
 }
+
+#[cfg(test)]
+mod tests;

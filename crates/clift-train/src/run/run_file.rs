@@ -3,14 +3,15 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clift_data::replace_file;
+use clift_data::{make_folder, remove_leftovers, replace_file};
 use serde::{Deserialize, Serialize};
 
 use crate::config::config::Config;
 use crate::config::parse::parse_config;
-use crate::error::TrainError;
-use crate::events::Stage;
+use crate::error::{TrainError, bad};
+use crate::events::{Event, Sink, Stage};
 use crate::run::extend::{ExtensionRecord, StepExtension};
+use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::training_data::TrainingData;
 
 const FILE: &str = "run.json";
@@ -66,6 +67,67 @@ impl RunFile {
     }
 }
 
+/// Options of a run beside its config.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RunOptions {
+    /// Run only this stage.
+    pub only: Option<Stage>,
+    /// Train and evaluate on this number of training scenes.
+    pub overfit: Option<usize>,
+    /// Start a new run; the existing run directory is renamed.
+    pub fresh: bool,
+    /// Allow larger step counts than those of the existing run.
+    pub extend: bool,
+}
+
+/// Parts of a run with a folder.
+const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
+
+/// Locks the run directory of a config, new or existing, and writes the resolved config to it. Returns the lock, and the
+/// `data.hold_out` of the run.
+///
+/// # Errors
+/// [`TrainError::OtherRun`], [`TrainError::Locked`] and [`TrainError::Io`].
+pub(crate) fn open_folder(
+    mut config: Config,
+    options: &RunOptions,
+    sink: &mut dyn Sink,
+) -> Result<(RunLock, usize), TrainError> {
+    let folder = &config.run_dir;
+    if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
+        return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
+    }
+    if options.fresh && folder.exists() {
+        // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
+        drop(RunLock::take(folder, LockedFolder::Run, sink)?);
+        let moved = free_name(folder);
+        std::fs::rename(folder, &moved).map_err(TrainError::io("renaming the existing run", folder))?;
+        sink.event(&Event::Message(format!("renamed the existing run to {}", moved.display())));
+    }
+    make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
+    let lock = RunLock::take(folder, LockedFolder::Run, sink)?;
+    remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
+    // A run that failed before its first stage may get other settings.
+    let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
+    let mut file = RunFile::new(options.overfit);
+    if folder.join("config.toml").exists() && has_begun {
+        let found = RunFile::read(folder)?;
+        if !TrainingData::read(&config.run_dir)?.has_key {
+            // A run from before the key resumes with the frames that it was started with.
+            config.data.hold_out = 0;
+        }
+        let folder = &config.run_dir;
+        let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
+        file.extended = found.extended;
+        for extension in extensions {
+            file.extended.push(extension.apply(folder, sink)?);
+        }
+    }
+    file.write(folder)?;
+    write_config(&config)?;
+    Ok((lock, config.data.hold_out))
+}
+
 /// Checks that a run directory is still at its path: a process that has it open must not make a second one there.
 ///
 /// # Errors
@@ -75,7 +137,7 @@ pub(crate) fn require_run(folder: &Path) -> Result<(), TrainError> {
 }
 
 /// Writes every key of a config to its run directory.
-pub(crate) fn write_config(config: &Config) -> Result<(), TrainError> {
+fn write_config(config: &Config) -> Result<(), TrainError> {
     let path = config.run_dir.join("config.toml");
     let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &path))?;
     replace_file(&path, text.as_bytes()).map_err(TrainError::io("writing the config", &path))
@@ -85,7 +147,7 @@ pub(crate) fn write_config(config: &Config) -> Result<(), TrainError> {
 ///
 /// # Errors
 /// [`TrainError::OtherRun`] for any other difference in keys that affect the result.
-pub(crate) fn compare_settings(
+fn compare_settings(
     folder: &Path,
     found: &RunFile,
     config: &Config,
@@ -155,7 +217,7 @@ fn flatten(table: toml::Table) -> BTreeMap<String, String> {
 }
 
 /// Returns the first free name of `runs/tiny.1`, `runs/tiny.2`, .. for `runs/tiny`.
-pub fn free_name(folder: &Path) -> PathBuf {
+fn free_name(folder: &Path) -> PathBuf {
     let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let mut number = 1;
     loop {

@@ -10,6 +10,8 @@ use burn::tensor::Device;
 use clift_data::Prefetcher;
 
 use crate::config::config::Config;
+use crate::distributed::parts::BatchParts;
+use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::stage::settings::StageSettings;
 use crate::step::batch::StageBatch;
@@ -27,6 +29,9 @@ pub struct StagePlan<'a> {
     pub folder: PathBuf,
     /// The autodiff device.
     pub device: Device,
+    pub ranks: &'a Ranks,
+    /// Division of the batch of a step.
+    pub parts: BatchParts,
 }
 
 impl StagePlan<'_> {

@@ -4,11 +4,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use burn::module::Module;
-use clift_data::make_folder;
-use clift_model::Clift;
+use clift_data::{make_folder, plural};
+use clift_model::{Clift, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, Progress};
+use crate::distributed::parts::BatchParts;
+use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
 use crate::run::batch_wait::BatchWait;
@@ -21,7 +23,7 @@ use crate::step::batch::StageBatch;
 use crate::step::loss::{Loss, psnr_of_mse};
 use crate::step::loss_scale::LossScale;
 use crate::step::schedule::learning_rate;
-use crate::step::step_guard::{SkippedStep, SkippedStepScene, StepAnomaly};
+use crate::step::step_guard::{BatchScenes, SkippedStep, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
 
 impl StagePlan<'_> {
@@ -33,13 +35,16 @@ impl StagePlan<'_> {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
-        require_run(&self.config.run_dir)?;
         let started = Instant::now();
-        let Self { settings, config, folder, device, .. } = self;
+        let Self { settings, config, folder, device, ranks, .. } = self;
         let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
         let checkpoints = Checkpoints::new(folder.join("checkpoints"), config.checkpoint.clone());
         let checkpoints = checkpoints.with_model(config.model.clone());
-        let model = match checkpoints.newest()? {
+        let newest = ranks.from_root(|| {
+            require_run(&config.run_dir)?;
+            checkpoints.newest_step()
+        })?;
+        let model = match newest {
             // The checkpoint replaces all parameters.
             Some(_) => Clift::new(&config.model, config.seed, device),
             None => start(sink)?,
@@ -54,10 +59,23 @@ impl StagePlan<'_> {
             loss_scale: LossScale::of(config.precision),
             ..TrainState::new(model, optimizer, device.clone())
         };
-        let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
+        let progress = match newest {
+            Some(_) if ranks.is_root() => checkpoints.resume(&mut train_state)?,
+            Some(step) => Some(checkpoints.load(step, &mut train_state)?),
+            None => None,
+        };
+        let progress = progress.unwrap_or_default();
         train_state.model = freeze(stage, train_state.model);
-        make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
-        let mut log = RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?;
+        let mut log = if ranks.is_root() {
+            make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
+            RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?
+        } else {
+            RunLog::silent(sink)
+        };
+        require_same_weights(&train_state, ranks)?;
+        for line in parts_notes(self.parts, ranks) {
+            log.event(&Event::Message(line));
+        }
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
         let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
@@ -103,12 +121,17 @@ impl<'a> TrainLoop<'a> {
             if let Some(hint) = batch_wait.add(asked.elapsed(), &self.plan.config.data) {
                 self.log.event(&Event::Message(hint));
             }
-            let batch = match batch {
+            // Also an error of another rank.
+            let batch = batch.and_then(|batch| {
+                let scenes = BatchScenes::gather(&batch, self.plan.parts, self.plan.ranks)?;
+                Ok((batch, scenes))
+            });
+            let (batch, scenes) = match batch {
                 Ok(batch) => batch,
                 Err(error) => return Err(self.save_before(error, &train_state)),
             };
-            train_state = self.step(train_state, &batch)?;
-            let is_stopped = self.stop.load(Ordering::Relaxed);
+            train_state = self.step(train_state, &batch, &scenes)?;
+            let is_stopped = self.plan.ranks.any(self.stop.load(Ordering::Relaxed))?;
             if is_stopped || self.is_checkpoint_due() {
                 self.save(&train_state)?;
             }
@@ -123,12 +146,17 @@ impl<'a> TrainLoop<'a> {
     }
 
     /// Makes or skips the next step.
-    fn step(&mut self, train_state: TrainState, batch: &StageBatch) -> Result<TrainState, TrainError> {
+    fn step(
+        &mut self,
+        train_state: TrainState,
+        batch: &StageBatch,
+        scenes: &BatchScenes,
+    ) -> Result<TrainState, TrainError> {
         let started = Instant::now();
-        for skip in &batch.skipped {
+        for skip in &scenes.skipped {
             self.log.skip(self.plan.settings.stage, self.progress.step + 1, skip);
         }
-        let StageSettings { steps: num_steps, accumulate, optimizer, .. } = self.plan.settings;
+        let StageSettings { steps: num_steps, optimizer, .. } = self.plan.settings;
         let step = self.progress.step + 1;
         let lr = learning_rate(optimizer, step, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
@@ -138,8 +166,8 @@ impl<'a> TrainLoop<'a> {
             anomaly = recent.anomaly(loss, grad_norm, optimizer);
             anomaly.is_none()
         };
-        let (mut train_state, update) =
-            train_state.step_if(batch, accumulate, rate, optimizer.max_grad_norm, accept)?;
+        let ranks = (self.plan.parts, self.plan.ranks);
+        let (mut train_state, update) = train_state.step_if(batch, ranks, rate, optimizer.max_grad_norm, accept)?;
         self.progress.step = step;
         self.report(update, lr, started);
         if train_state.adapt_loss_scale(&update) {
@@ -154,7 +182,7 @@ impl<'a> TrainLoop<'a> {
                 self.progress.bad_steps = 0;
                 self.progress.recent.push(update.loss, update.grad_norm);
             }
-            Some(anomaly) => self.skip_step(anomaly, update, batch)?,
+            Some(anomaly) => self.skip_step(anomaly, update, scenes)?,
         }
         Ok(train_state)
     }
@@ -173,7 +201,7 @@ impl<'a> TrainLoop<'a> {
     }
 
     /// Counts and logs a step without update; [`TrainError::Diverged`] after `max_bad_steps` consecutive ones.
-    fn skip_step(&mut self, anomaly: StepAnomaly, update: Update, batch: &StageBatch) -> Result<(), TrainError> {
+    fn skip_step(&mut self, anomaly: StepAnomaly, update: Update, batch: &BatchScenes) -> Result<(), TrainError> {
         self.progress.bad_steps += 1;
         self.progress.num_bad_steps += 1;
         let finite = |value: f64| value.is_finite().then_some(value);
@@ -187,7 +215,7 @@ impl<'a> TrainLoop<'a> {
             median_loss,
             median_grad_norm,
             in_a_row: self.progress.bad_steps,
-            scenes: SkippedStepScene::all(batch),
+            scenes: batch.scenes.clone(),
         };
         self.log.bad_step(&line);
         let keys = line.scenes.iter().map(|scene| scene.key.as_str()).collect::<Vec<_>>().join(", ");
@@ -201,20 +229,30 @@ impl<'a> TrainLoop<'a> {
         Err(TrainError::Diverged { count, step, reason: anomaly.to_string(), keys, checkpoint })
     }
 
+    /// Saves on rank 0, after a check that all ranks have the same weights.
     fn save(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
+        let ranks = self.plan.ranks;
+        require_same_weights(train_state, ranks)?;
+        ranks.from_root(|| self.save_alone(train_state))?;
+        self.saved = self.progress.step;
+        Ok(())
+    }
+
+    fn save_alone(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
         require_run(&self.plan.config.run_dir)?;
         // A resumed run does not write the lines of these steps again.
         self.log.check()?;
         let path = self.checkpoints.save(train_state, &self.progress)?;
-        self.saved = self.progress.step;
         self.log.event(&Event::Checkpoint { path });
         Ok(())
     }
 
-    /// Saves the steps made so far before the run ends with `error`, which they did not cause.
+    /// Saves the steps made so far before the run ends with `error`, which they did not cause. Sends no message: another
+    /// rank may have ended.
     fn save_before(&mut self, error: TrainError, train_state: &TrainState) -> TrainError {
-        if self.saved < self.progress.step
-            && let Err(second) = self.save(train_state)
+        if self.plan.ranks.is_root()
+            && self.saved < self.progress.step
+            && let Err(second) = self.save_alone(train_state)
         {
             self.log.event(&Event::Warning(format!("saving the steps made so far failed: {second}")));
         }
@@ -228,11 +266,13 @@ impl<'a> TrainLoop<'a> {
         if !is_due || validated == step {
             return Ok(());
         }
-        let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
-        require_run(&self.plan.config.run_dir)?;
+        let (stage, samples, ranks) = (self.plan.settings.stage, self.plan.folder.join("samples"), self.plan.ranks);
+        if ranks.is_root() {
+            require_run(&self.plan.config.run_dir)?;
+        }
         let model = train_state.model.valid();
-        let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
-        if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
+        let psnr = self.validation.validate(&model, stage, step, (&samples, ranks), self.stop, &mut self.log)?;
+        if psnr.is_none() && ranks.any(self.stop.load(Ordering::Relaxed))? {
             if self.saved < step {
                 self.save(train_state)?;
             }
@@ -248,7 +288,7 @@ impl<'a> TrainLoop<'a> {
         if self.progress.best.is_none_or(|best| psnr > best.psnr) {
             self.progress.best = Some(Best { step, psnr });
         }
-        self.checkpoints.update(&self.progress)
+        if ranks.is_root() { self.checkpoints.update(&self.progress) } else { Ok(()) }
     }
 
     fn is_checkpoint_due(&self) -> bool {
@@ -277,6 +317,30 @@ impl<'a> TrainLoop<'a> {
             checkpoint: self.newest_checkpoint(),
         }
     }
+}
+
+/// Checks that the weights are the same on every rank.
+fn require_same_weights(train_state: &TrainState, ranks: &Ranks) -> Result<(), TrainError> {
+    if ranks.num_ranks() == 1 {
+        return Ok(());
+    }
+    ranks.require_same("the weights", &weights_hash(&train_state.model))
+}
+
+/// Describes how several ranks share a batch.
+fn parts_notes(parts: BatchParts, ranks: &Ranks) -> Vec<String> {
+    let (num_ranks, num_parts, num_scenes) = (ranks.num_ranks(), parts.num_parts(), parts.batch_size());
+    if num_ranks == 1 {
+        return Vec::new();
+    }
+    let mut notes =
+        vec![format!("{num_ranks} ranks share batches of {} in {num_parts} parts", plural(num_scenes, "scene"))];
+    if !num_parts.is_multiple_of(num_ranks) {
+        notes.push(format!(
+            "{num_parts} parts leave ranks idle; a multiple of {num_ranks} in accumulate keeps them busy"
+        ));
+    }
+    notes
 }
 
 fn is_multiple(step: u64, every: u64) -> bool {

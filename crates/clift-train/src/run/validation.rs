@@ -13,6 +13,7 @@ use clift_eval::{
 use clift_model::{Clift, TokenCoding, TokenCount, TrainedModel};
 
 use crate::config::config::Config;
+use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{EvalEvents, Event, Sink, Stage};
 use crate::footprint::largest_tensor;
@@ -70,7 +71,7 @@ impl<'a> Validation<'a> {
         Ok(Self { config, evaluator })
     }
 
-    /// Measures a model without autodiff during training: with all tokens in stage 1, with one count of condensed tokens in
+    /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with one count of condensed tokens in
     /// stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB; `None` if no view could be measured
     /// or `stop` is set.
     ///
@@ -81,7 +82,7 @@ impl<'a> Validation<'a> {
         model: &Clift,
         stage: Stage,
         step: u64,
-        folder: &Path,
+        (folder, ranks): (&Path, &Ranks),
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Option<f64>, TrainError> {
@@ -109,7 +110,7 @@ impl<'a> Validation<'a> {
             figures.contact_sheet.write_png(&folder.join(format!("step-{step:09}.png")))
         };
         let limits = SceneLimits { num_scenes: eval.num_validation_scenes, num_figures: 1 };
-        let mut progress = EvalEvents { stop, sink, is_stage: false };
+        let mut progress = EvalEvents { stop, sink, ranks, is_stage: false };
         let measured = match self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, &mut progress) {
             Err(EvalError::Interrupted { .. }) => return Ok(None),
             measured => measured?.0,
@@ -121,7 +122,7 @@ impl<'a> Validation<'a> {
         Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
-    /// Evaluates models on the views of this validation.
+    /// Evaluates models on the views of this validation, the scenes shared by the ranks.
     ///
     /// # Errors
     /// As [`Evaluator::evaluate`].
@@ -129,11 +130,12 @@ impl<'a> Validation<'a> {
         &self,
         models: &EvalModels,
         request: &EvalRequest,
+        ranks: &Ranks,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = Instant::now();
-        let mut progress = EvalEvents { stop, sink, is_stage: true };
+        let mut progress = EvalEvents { stop, sink, ranks, is_stage: true };
         let training = training_curves(&self.config.run_dir);
         let summary =
             self.evaluator.evaluate(models, request.external, training, request.folder.path(), &mut progress)?;

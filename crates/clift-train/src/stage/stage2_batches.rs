@@ -11,6 +11,7 @@ use clift_model::SceneClusters;
 
 use crate::cluster_cache::cache::{CacheEntry, ClusterCache};
 use crate::config::config::Config;
+use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 
@@ -23,13 +24,19 @@ pub struct Stage2Batches {
     cache: Arc<ClusterCache>,
     /// Entries with equal numbers of tokens and of clusters, which a batch needs.
     groups: Vec<Vec<usize>>,
-    batch_size: usize,
+    parts: BatchParts,
     num_targets: usize,
     seed: u64,
 }
 
 impl Stage2Batches {
-    pub fn new(config: &Config, reader: &ClipReader, cache: Arc<ClusterCache>) -> Result<Self, TrainError> {
+    /// Makes batches of the slots that `parts` gives to this rank.
+    pub fn new(
+        config: &Config,
+        reader: &ClipReader,
+        cache: Arc<ClusterCache>,
+        parts: BatchParts,
+    ) -> Result<Self, TrainError> {
         let mut groups: BTreeMap<_, Vec<usize>> = BTreeMap::new();
         for (i, entry) in cache.entries().iter().enumerate() {
             groups.entry((entry.num_tokens, entry.num_storage_tokens)).or_default().push(i);
@@ -41,7 +48,7 @@ impl Stage2Batches {
             reader: reader.clone(),
             cache,
             groups: groups.into_values().collect(),
-            batch_size: config.stage2.batch_size,
+            parts,
             num_targets: config.data.views.num_targets,
             seed: derive_seed(config.seed, "stage2"),
         })
@@ -51,8 +58,10 @@ impl Stage2Batches {
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let group = &self.groups[self.sample_group(step)];
         let (mut clips, mut clusters, mut skipped) = (Vec::new(), Vec::new(), Vec::new());
-        for slot in 0..self.batch_size {
-            let (clip, scene) = self.fill_slot(step, slot, group, &mut skipped)?;
+        for slot in self.parts.slots() {
+            let mut of_slot = Vec::new();
+            let (clip, scene) = self.fill_slot(step, slot, group, &mut of_slot)?;
+            skipped.extend(of_slot.into_iter().map(|skip| (slot, skip)));
             clips.push(clip);
             clusters.push(scene);
         }

@@ -4,17 +4,27 @@
 use clift_data::{Clip, SkippedScene};
 use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters, Tokens};
 
+use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
 
-/// Clips of an update, with equal numbers of views, and the tokens from which they are rendered.
+/// Clips of an update, with equal numbers of views, and the tokens from which they are rendered. A rank has those of its
+/// slots.
 #[derive(Clone, Debug)]
 pub struct StageBatch {
     /// One clip per slot.
     pub clips: Vec<Clip>,
     /// Tokens of the renderer, per slot.
     pub tokens: TokenSelection,
-    /// Scenes that were skipped while the batch was filled.
-    pub skipped: Vec<SkippedScene>,
+    /// Scenes that were skipped while a slot was filled, with the slot.
+    pub skipped: Vec<(usize, SkippedScene)>,
+}
+
+/// A part of a batch.
+pub(crate) struct MicroBatch<'a> {
+    pub clips: &'a [Clip],
+    pub tokens: TokenSelection,
+    /// Share of the whole batch.
+    pub share: f64,
 }
 
 /// Tokens that the renderer receives.
@@ -29,17 +39,20 @@ pub enum TokenSelection {
 }
 
 impl StageBatch {
-    /// Splits the batch into `count` micro-batches of nearly equal size: clips and tokens.
-    pub(crate) fn parts(&self, count: usize) -> impl Iterator<Item = (&[Clip], TokenSelection)> {
-        let batch_size = self.clips.len();
-        (0..count).map(move |part| {
-            let range = part * batch_size / count..(part + 1) * batch_size / count;
+    /// Returns the part of every round; `None` where this rank has none.
+    pub(crate) fn rounds(&self, parts: BatchParts) -> impl Iterator<Item = Option<MicroBatch<'_>>> {
+        let mut start = 0;
+        (0..parts.num_rounds()).map(move |round| {
+            let count = parts.slots_of_round(round).len();
+            let range = start..start + count;
+            start = range.end;
             let tokens = match &self.tokens {
                 TokenSelection::Subsets(subsets) => TokenSelection::Subsets(subsets[range.clone()].to_vec()),
                 TokenSelection::All => TokenSelection::All,
                 TokenSelection::Clusters(clusters) => TokenSelection::Clusters(clusters[range.clone()].to_vec()),
             };
-            (&self.clips[range], tokens)
+            let share = count as f64 / parts.batch_size() as f64;
+            (count > 0).then(|| MicroBatch { clips: &self.clips[range], tokens, share })
         })
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! - `batch`: host batch of one update
 //! - `device_batch`: a batch on a device; its loss
+//! - `gradient_sum`: gradients of all ranks
 //! - `loss`: MSE and perceptual term
 //! - `loss_scale`: loss scaling for f16
 //! - `optimizer`: `AdamW`, gradient norm and clipping
@@ -14,6 +15,7 @@
 pub(crate) mod activation_checkpointing;
 pub(crate) mod batch;
 pub(crate) mod device_batch;
+pub(crate) mod gradient_sum;
 pub(crate) mod loss;
 pub(crate) mod loss_scale;
 pub(crate) mod optimizer;

@@ -2,10 +2,13 @@
 
 use std::collections::VecDeque;
 
-use clift_data::median;
+use clift_data::{Clip, SkippedScene, median};
 use serde::{Deserialize, Serialize};
 
 use crate::config::config::OptimizerConfig;
+use crate::distributed::parts::BatchParts;
+use crate::distributed::ranks::Ranks;
+use crate::error::TrainError;
 use crate::events::Stage;
 use crate::step::batch::StageBatch;
 
@@ -98,14 +101,37 @@ pub struct SkippedStepScene {
 }
 
 impl SkippedStepScene {
-    pub fn all(batch: &StageBatch) -> Vec<Self> {
-        let scene = |clip: &clift_data::Clip| Self {
+    fn of(clip: &Clip) -> Self {
+        Self {
             key: clip.key.clone(),
             context: clip.context.frame_index.clone(),
             target: clip.target.frame_index.clone(),
-        };
-        batch.clips.iter().map(scene).collect()
+        }
     }
+}
+
+/// The scenes of a whole batch for the logs, in the order of slots.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BatchScenes {
+    pub scenes: Vec<SkippedStepScene>,
+    /// Scenes that were skipped while the batch was filled.
+    pub skipped: Vec<SkippedScene>,
+}
+
+impl BatchScenes {
+    /// Joins the scenes of all ranks. `batch` has those of this rank's slots.
+    pub fn gather(batch: &StageBatch, parts: BatchParts, ranks: &Ranks) -> Result<Self, TrainError> {
+        let scenes: Vec<_> = parts.slots().zip(batch.clips.iter().map(SkippedStepScene::of)).collect();
+        let (scenes, skipped): (Vec<_>, Vec<_>) = ranks.gather((scenes, batch.skipped.clone()))?.into_iter().unzip();
+        Ok(Self { scenes: in_order(scenes), skipped: in_order(skipped) })
+    }
+}
+
+/// Joins the items of all ranks in the order of slots.
+fn in_order<T>(items: Vec<Vec<(usize, T)>>) -> Vec<T> {
+    let mut items: Vec<_> = items.into_iter().flatten().collect();
+    items.sort_by_key(|(slot, _)| *slot);
+    items.into_iter().map(|(_, item)| item).collect()
 }
 
 #[cfg(test)]

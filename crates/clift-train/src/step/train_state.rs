@@ -6,10 +6,13 @@ use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 
 use crate::config::config::OptimizerConfig;
+use crate::distributed::parts::BatchParts;
+use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::step::activation_checkpointing;
-use crate::step::batch::StageBatch;
+use crate::step::batch::{MicroBatch, StageBatch};
 use crate::step::device_batch::{DeviceBatch, render_loss};
+use crate::step::gradient_sum::GradientSum;
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
 use crate::step::optimizer::{clip_factor, make_optimizer, norm_on_device, scale_gradients};
@@ -62,19 +65,23 @@ impl TrainState {
         rate: ModuleLearningRate,
         max_grad_norm: f64,
     ) -> Result<(Self, Update), TrainError> {
-        self.step_if(batch, accumulate, rate, max_grad_norm, |loss, norm| loss.is_finite() && norm.is_finite())
+        let ranks = Ranks::single();
+        let parts = BatchParts::new(batch.clips.len(), accumulate, &ranks);
+        let accept = |loss: f64, norm: f64| loss.is_finite() && norm.is_finite();
+        self.step_if(batch, (parts, &ranks), rate, max_grad_norm, accept)
     }
 
-    /// Makes one update from a batch and applies it if `accept(loss, grad_norm)`.
+    /// Makes one update from the batch of all ranks, of which `batch` has the slots of this one, and applies it if
+    /// `accept(loss, grad_norm)`. Every rank makes the same update of the same weights.
     ///
     /// Consumes and returns the state, so that the update writes the weights in place.
     ///
     /// # Errors
-    /// Those of the model and of the device.
+    /// Those of the model, of the device and of the other ranks.
     pub fn step_if(
         self,
         batch: &StageBatch,
-        accumulate: usize,
+        (parts, ranks): (BatchParts, &Ranks),
         rate: ModuleLearningRate,
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
@@ -84,29 +91,37 @@ impl TrainState {
         let _scope = precision.scope();
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
         let mut accumulator = GradientsAccumulator::<Clift>::new();
+        let mut sum = (ranks.num_ranks() > 1).then(GradientSum::default);
         let mut read = HostReads::default();
-        for (clips, tokens) in batch.parts(accumulate) {
-            let share = clips.len() as f64 / batch.clips.len() as f64;
-            let device_batch = DeviceBatch::upload(clips, &device)?;
-            let parts = if activation_checkpointing {
-                activation_checkpointing::backward(
-                    &model,
-                    &device_batch,
-                    &tokens,
-                    &loss,
-                    share * factor,
-                    &mut accumulator,
-                )?
-            } else {
-                let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss)?;
-                let grads = total.clone().mul_scalar(share * factor).backward();
-                accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
-                LossParts { total: total.inner(), mse: mse.inner() }
-            };
-            read.add(share, parts);
+        for (round, micro_batch) in batch.rounds(parts).enumerate() {
+            if let Some(MicroBatch { clips, tokens, share }) = micro_batch {
+                let device_batch = DeviceBatch::upload(clips, &device)?;
+                let losses = if activation_checkpointing {
+                    activation_checkpointing::backward(
+                        &model,
+                        &device_batch,
+                        &tokens,
+                        &loss,
+                        share * factor,
+                        &mut accumulator,
+                    )?
+                } else {
+                    let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss)?;
+                    let grads = total.clone().mul_scalar(share * factor).backward();
+                    accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
+                    LossParts { total: total.inner(), mse: mse.inner() }
+                };
+                read.add(share, losses);
+            }
+            if let Some(sum) = &mut sum {
+                sum.add(&model, accumulator.grads(), parts.num_working(round), ranks)?;
+            }
         }
-        let grads = accumulator.grads();
-        let mut update = read.finish(norm_on_device(&model, &grads))?;
+        let grads = match sum {
+            Some(sum) => sum.finish(&model, &device, ranks),
+            None => accumulator.grads(),
+        };
+        let mut update = read.finish(norm_on_device(&model, &grads), ranks)?;
         update.grad_norm /= factor;
         update.applied = accept(update.loss, update.grad_norm);
         let model = if update.applied {
@@ -146,15 +161,28 @@ impl HostReads {
         self.values.extend([parts.total, parts.mse]);
     }
 
-    /// Reads the losses of the whole batch and the gradient norm, 0 without gradients, of an update not applied yet.
-    fn finish(mut self, grad_norm: Option<Tensor<1>>) -> Result<Update, TrainError> {
+    /// Reads the losses of the whole batch, added in the order of its parts, and the gradient norm of rank 0, which decides
+    /// for all; 0 without gradients. The update is not applied yet.
+    fn finish(mut self, grad_norm: Option<Tensor<1>>, ranks: &Ranks) -> Result<Update, TrainError> {
         self.values.extend(grad_norm);
-        let values = Tensor::cat(self.values, 0).try_into_vec_as::<f64>();
+        let values =
+            if self.values.is_empty() { Ok(Vec::new()) } else { Tensor::cat(self.values, 0).try_into_vec_as::<f64>() };
         let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
-        let (parts, norm) = values.split_at(2 * self.shares.len());
-        let of =
-            |offset: usize| parts.iter().skip(offset).step_by(2).zip(&self.shares).map(|(v, share)| share * v).sum();
-        let grad_norm = norm.first().copied().unwrap_or(0.0);
-        Ok(Update { loss: of(0), mse: of(1), grad_norm, applied: false })
+        let (losses, norm) = values.split_at(2 * self.shares.len());
+        let own: Vec<_> = losses
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .zip(&self.shares)
+            .map(|(of, share)| of.map(|value| share * value))
+            .collect();
+        let all = ranks.gather((own, norm.first().copied().unwrap_or(0.0)))?;
+        let num_rounds = all[0].0.len();
+        let of = |i: usize| {
+            let in_order =
+                (0..num_rounds).flat_map(|round| all.iter().filter_map(move |(losses, _)| losses.get(round)));
+            in_order.map(|losses| losses[i]).sum()
+        };
+        Ok(Update { loss: of(0), mse: of(1), grad_norm: all[0].1, applied: false })
     }
 }

@@ -1,6 +1,6 @@
 //! One file or folder per command, named after the command: its arguments, the call, the printed result.
 //!
-//! Shared by the commands: the folder `args`.
+//! Shared by the commands: the folder `args`, and `ranks`.
 
 pub(crate) mod args;
 pub(crate) mod bench;
@@ -16,6 +16,7 @@ pub(crate) mod flops;
 pub(crate) mod import;
 pub(crate) mod metrics;
 pub(crate) mod plan;
+pub(crate) mod ranks;
 pub(crate) mod render;
 pub(crate) mod train;
 pub(crate) mod view;

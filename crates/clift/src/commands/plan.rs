@@ -2,14 +2,15 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{PartPlan, Plan, check_plan, missing_weights, plan};
+use clift_bench::{PartPlan, Plan, PlanOptions, check_plan, missing_weights, plan};
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, largest_tensor, memory_warning};
 
+use crate::commands::args::parse::{parse_bytes, parse_count};
 use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 use crate::output::stdout::{print_result, print_warning};
 use crate::output::table::table;
-use crate::output::units::{duration, memory_size, seconds};
+use crate::output::units::{duration, file_size, memory_size, seconds};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, check_plan)?;
@@ -17,7 +18,8 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     for missing in missing_weights(&config) {
         print_warning(missing);
     }
-    let plan = plan(&config, !args.no_time)?;
+    let sent_bytes_per_s = args.bandwidth.map(|bytes| bytes as f64);
+    let plan = plan(&config, &PlanOptions { is_timed: !args.no_time, num_ranks: args.ranks, sent_bytes_per_s })?;
     print_result(&report_text(&plan))?;
     print_result(&largest_tensors(&config)?)?;
     if let Some(warning) = memory_warning(&config, plan.available_bytes)? {
@@ -44,7 +46,7 @@ fn largest_tensors(config: &Config) -> anyhow::Result<String> {
 }
 
 fn report_text(plan: &Plan) -> String {
-    let Plan { device, threads, parameters, num_tokens: [fewest, most], available_bytes, parts } = plan;
+    let Plan { num_ranks, device, threads, parameters, num_tokens: [fewest, most], available_bytes, parts } = plan;
     let available = available_bytes.map_or_else(|| "unknown".into(), memory_size);
     let tokens = if fewest == most { fewest.to_string() } else { format!("{fewest} to {most}") };
     let head = format!(
@@ -57,7 +59,13 @@ tokens per scene: {tokens}
     let columns = ["part", "trains", "count", "peak memory", "GMACs each", "reading each", "time each", "time"];
     let total: Option<f64> = parts.iter().map(PartPlan::total_s).sum();
     let total = total.map(|total| format!("\ntotal: {}", duration(total)));
-    [head, table(columns, parts.iter().map(cells))].into_iter().chain(total).collect::<Vec<_>>().join("\n")
+    let sums = (*num_ranks > 1).then(|| {
+        let sent = parts.iter().filter(|part| part.sent_bytes > 0);
+        let sent = sent.map(|part| format!("{} {}", part.part, file_size(part.sent_bytes))).collect::<Vec<_>>();
+        format!("\none of {num_ranks} ranks; sent by a rank per step: {}", sent.join(", "))
+    });
+    let table = table(columns, parts.iter().map(cells));
+    [head, table].into_iter().chain(total).chain(sums).collect::<Vec<_>>().join("\n")
 }
 
 fn cells(part: &PartPlan) -> [String; 8] {
@@ -84,6 +92,12 @@ pub struct PlanArgs {
     /// Skip the timing (it takes a few seconds)
     #[arg(long)]
     pub no_time: bool,
+    /// Plan for one of N ranks, each with a device like this one
+    #[arg(long, value_name = "N", value_parser = parse_count, default_value_t = 1)]
+    pub ranks: usize,
+    /// Add the sum over ranks at SIZE per second (`clift bench allreduce`)
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
+    pub bandwidth: Option<u64>,
     #[command(flatten)]
     pub json: JsonArg,
 }
@@ -103,12 +117,14 @@ mod tests {
             trained_parameters: if unit == "step" { 30 } else { 0 },
             gmacs: 1.5,
             peak_bytes: 3 << 29,
+            sent_bytes: 120,
             compute_s: seconds,
             busy_threads: None,
             loading_s: None,
             seconds,
         };
-        let plan = Plan {
+        let mut plan = Plan {
+            num_ranks: 1,
             device: DeviceName::Flex,
             threads: 2,
             parameters: Parameters { encoder: 10, lift_norm: 0, condenser: 20, renderer: 30, total: 60 },
@@ -125,5 +141,8 @@ part    trains  count        peak memory  GMACs each  reading each  time each  t
 stage1  30      7200 steps   1.50 GiB     1.500       -             500 ms     1 h 0 min
 eval    -       every scene  1.50 GiB     1.500       -             2.00 s     -";
         assert_eq!(report_text(&plan), expected);
+        plan.num_ranks = 8;
+        let expected = "\none of 8 ranks; sent by a rank per step: stage1 120 bytes, eval 120 bytes";
+        assert!(report_text(&plan).ends_with(expected));
     }
 }

@@ -1,27 +1,39 @@
 //! `clift train`.
 
 use std::path::PathBuf;
+use std::rc::Rc;
 
 use clift_eval::available_bytes;
-use clift_train::{Config, Run, RunOptions, Stage, memory_warning};
+use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, Stage, StageSettings, memory_warning};
 
 use crate::commands::args::parse::{parse_count, parse_stage};
 use crate::commands::args::shared_args::ConfigArgs;
+use crate::commands::ranks::{connect, finish};
 use crate::interrupt;
 use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_run, print_warning};
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
+    let ranks = connect()?;
+    finish(&ranks, train(args, &ranks))
+}
+
+fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, Config::validate)?;
     // Before the system ends a run for its memory after hours of training.
-    if let Ok(Some(warning)) = memory_warning(&config, available_bytes(config.device)) {
+    let mut of_rank = config.clone();
+    for stage in [Stage::Stage1, Stage::Stage2] {
+        let StageSettings { batch_size, accumulate, .. } = config.stage(stage);
+        of_rank.set_accumulate(stage, BatchParts::new(batch_size, accumulate, ranks).num_parts());
+    }
+    if let Ok(Some(warning)) = memory_warning(&of_rank, available_bytes(config.device)) {
         print_warning(warning);
     }
     let stop = interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();
     let (run_dir, has_latents) = (config.run_dir.clone(), config.model.has_latents());
-    let run = Run::open(config, &options, sink.as_mut())?;
+    let run = Run::open_on(ranks.clone(), config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
     summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, !has_latents))

@@ -17,6 +17,7 @@ use crate::output::visible::visible;
 /// a line for every step for `--verbose`.
 pub fn progress_sink() -> Box<dyn Sink> {
     match Verbosity::chosen() {
+        Verbosity::Silent => Box::new(|_: &Event| {}),
         Verbosity::Quiet => Box::new(|event: &Event| {
             if let Event::Warning(text) = event {
                 print_warning(text);

@@ -50,6 +50,9 @@ pub fn print_warning(text: impl Display) {
 
 /// Writes a line to the standard error. A failure is ignored: no other stream could report it.
 pub fn print_problem(text: &str) {
+    if Verbosity::chosen() == Verbosity::Silent {
+        return;
+    }
     drop(writeln!(std::io::stderr(), "{}", visible(text)));
 }
 

@@ -13,6 +13,8 @@ pub enum Verbosity {
     Normal = 1,
     /// A line for every training step instead of a bar.
     Verbose = 2,
+    /// Nothing, errors included: rank 0 prints for all.
+    Silent = 3,
 }
 
 static CHOSEN: AtomicU8 = AtomicU8::new(Verbosity::Normal as u8);
@@ -28,6 +30,7 @@ impl Verbosity {
         match CHOSEN.load(Ordering::Relaxed) {
             0 => Self::Quiet,
             2 => Self::Verbose,
+            3 => Self::Silent,
             _ => Self::Normal,
         }
     }

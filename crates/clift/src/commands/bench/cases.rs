@@ -6,6 +6,7 @@ use clap::Subcommand;
 use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchReport, BenchRow, MAX_CHECKED_TOKENS, run_bench};
 use clift_model::Precision;
 
+use crate::commands::bench::allreduce::BenchAllReduceArgs;
 use crate::commands::bench::data::BenchDataArgs;
 use crate::commands::bench::precision::BenchPrecisionArgs;
 use crate::commands::bench::timing_args::TimingArgs;
@@ -80,6 +81,8 @@ fn cells(row: &BenchRow) -> [String; 5] {
 /// Measurements other than the cases of a config.
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
+    /// Time the sum over ranks, under `mpirun` or `srun`
+    Allreduce(BenchAllReduceArgs),
     /// Time reading clips from a data set, in order and at random
     Data(BenchDataArgs),
     /// Compare f16 with f32 matrix products: time, loss, PSNR, gradient

@@ -1,0 +1,77 @@
+//! A rank that ends early ends all, with one message.
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use crate::engine::{is_running, one_at_a_time, ranks_of, signal, start_train};
+use crate::support::{BINARY, Place, Ran, SmallDisk, finish, start};
+
+const LONG: [&str; 4] = ["stage1.steps=4000", "stage2.steps=10", "eval.every=0", "checkpoint={every=50, keep=2}"];
+
+fn num_errors(ran: &Ran) -> usize {
+    ran.stderr.lines().filter(|line| line.starts_with("error: ")).count()
+}
+
+#[test]
+fn a_killed_rank_ends_the_others_within_seconds() {
+    let _one = one_at_a_time();
+    let place = Place::new();
+    let mut child = start_train(&place, 3, "run", &LONG);
+    place.wait_for_steps("run", &mut child, 60);
+    let ids = ranks_of(&child);
+    assert_eq!(ids.len(), 3);
+    let killed = Instant::now();
+    signal(ids[2], "-KILL");
+    let ran = finish(child);
+    assert!(killed.elapsed() < Duration::from_secs(10), "{:?}", killed.elapsed());
+    assert!(ran.code != Some(0) && ran.stderr.contains("signal 9 (Killed)"), "{}", ran.stderr);
+    assert!(ids.iter().all(|id| !is_running(*id)), "no rank is left");
+}
+
+#[test]
+fn a_signal_to_one_rank_saves_the_run() {
+    let _one = one_at_a_time();
+    let place = Place::new();
+    let mut child = start_train(&place, 2, "run", &LONG);
+    place.wait_for_steps("run", &mut child, 60);
+    signal(ranks_of(&child)[1], "-TERM");
+    let ran = finish(child);
+    assert_eq!(num_errors(&ran), 1, "{}", ran.stderr);
+    assert!(ran.stderr.contains("error: interrupted at step "), "{}", ran.stderr);
+    let steps = place.metrics("run").len() as u64;
+    assert_eq!(place.checkpoints("run", "stage1").last(), Some(&steps), "the step is finished and saved");
+}
+
+#[test]
+fn a_full_disk_ends_all_with_one_message() {
+    let _one = one_at_a_time();
+    let place = Place::new();
+    let folder = place.at("disk");
+    let Some(disk) = SmallDisk::mount(&folder, 200) else { return println!("passed by: no right to mount a tmpfs") };
+    let set = ["stage1.steps=24", "checkpoint={every=2, keep=20}"];
+    let started = Instant::now();
+    let ran = finish(start_train(&place, 2, "disk/run", &set));
+    assert!(started.elapsed() < Duration::from_secs(30), "{:?}", started.elapsed());
+    assert_eq!(ran.code, Some(1), "{}", ran.stderr);
+    assert_eq!(num_errors(&ran), 1, "{}", ran.stderr);
+    assert!(ran.stderr.contains("No space left on device") && ran.stderr.contains("stage1 stopped"), "{}", ran.stderr);
+    drop(disk);
+}
+
+#[test]
+fn a_wrong_config_is_reported_once() {
+    let _one = one_at_a_time();
+    let place = Place::new();
+    let ran = finish(start_train(&place, 2, "run", &["stage1.batch_size=0"]));
+    assert_eq!(ran.code, Some(2), "{}", ran.stderr);
+    assert_eq!(num_errors(&ran), 1, "{}", ran.stderr);
+}
+
+#[test]
+fn a_launcher_that_mpi_does_not_know_is_named() {
+    let place = Place::new();
+    let step = [("SLURM_STEP_NUM_TASKS", "2"), ("SLURM_PROCID", "0")];
+    let mut command = Command::new(BINARY);
+    let ran = finish(start(command.envs(step).args(place.train_args("run", &[]))));
+    ran.fails_with(2, &["a launcher started 2 processes, and MPI connects 1 of them", "srun --mpi=pmix"]);
+}

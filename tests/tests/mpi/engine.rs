@@ -1,0 +1,53 @@
+//! Starts ranks with `mpirun`.
+
+use std::process::{Child, Command};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use crate::support::{BINARY, Place, start};
+
+/// One run of several ranks at a time: ranks that wait keep their cores busy.
+pub fn one_at_a_time() -> MutexGuard<'static, ()> {
+    static ONE: Mutex<()> = Mutex::new(());
+    ONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// `mpirun` with `num_ranks` ranks of one thread, also as root, on any number of cores.
+pub fn mpirun(num_ranks: usize) -> Command {
+    let mut command = Command::new("mpirun");
+    command.args(["-n", &num_ranks.to_string()]).env("RAYON_NUM_THREADS", "1");
+    for (name, value) in [
+        ("OMPI_ALLOW_RUN_AS_ROOT", "1"),
+        ("OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "1"),
+        ("OMPI_MCA_rmaps_base_oversubscribe", "1"),
+        ("OMPI_MCA_hwloc_base_binding_policy", "none"),
+        // Ranks that wait let others compute.
+        ("OMPI_MCA_mpi_yield_when_idle", "1"),
+    ] {
+        command.env(name, value);
+    }
+    command
+}
+
+pub fn start_train(place: &Place, num_ranks: usize, words: &str, set: &[&str]) -> Child {
+    start(mpirun(num_ranks).arg(BINARY).args(place.train_args(words, set)))
+}
+
+/// The process ids of the ranks of a running `mpirun`, in no order.
+pub fn ranks_of(mpirun: &Child) -> Vec<u32> {
+    let id = mpirun.id();
+    let children = std::fs::read_to_string(format!("/proc/{id}/task/{id}/children")).unwrap_or_default();
+    let is_rank =
+        |id: &u32| std::fs::read_to_string(format!("/proc/{id}/cmdline")).is_ok_and(|words| words.starts_with(BINARY));
+    children.split_whitespace().filter_map(|id| id.parse().ok()).filter(is_rank).collect()
+}
+
+pub fn signal(id: u32, name: &str) {
+    // The rank may have ended meanwhile.
+    drop(Command::new("kill").args([name, &id.to_string()]).output());
+}
+
+/// Whether a process is there, not counting one that has ended and that nobody has waited for.
+pub fn is_running(id: u32) -> bool {
+    let state = std::fs::read_to_string(format!("/proc/{id}/stat")).unwrap_or_default();
+    state.rsplit(')').next().is_some_and(|rest| !rest.is_empty() && !rest.trim_start().starts_with('Z'))
+}
