@@ -148,7 +148,7 @@ fn dl3dv_starts_from_re10k_and_lists_new_parameters() {
     let ran = place.train("dl3dv --only stage1", &set).ok();
     let ran = ran.notes("encoder.blocks.0.attn.qk_norm.query.weight");
     let ran = ran.notes("renderer.blocks.1.cross_attn.qk_norm.key.weight");
-    ran.notes("lift_norm.norm.bias, lift_norm.norm.weight").notes("unused in the file: none");
+    ran.notes("lift_norm.norm.bias, lift_norm.norm.weight").notes("unused in the file: condenser.released.");
     let (old, new) = (place.model("re10k"), place.weights("dl3dv", "stage1"));
     for (name, values) in old.0.iter().filter(|(name, _)| !name.starts_with("condenser.")) {
         assert_eq!(&new.0[name], values, "{name}");

@@ -76,8 +76,9 @@ impl Evaluator {
         (text, self.split.warning().map(str::to_owned).into_iter().chain(context_targets_note(num_given)).collect())
     }
 
-    /// Measures every scene, shared with other processes by `progress`, the first of which writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
-    /// contact sheets to `folder`. Scores the images of `external_methods` too. The report has the curves of `training`.
+    /// Measures every scene, shared with other processes by `progress`. The first process writes `report.html`,
+    /// `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the contact sheets to `folder`. Scores the images of
+    /// `external_methods` too. The report has the curves of `training`.
     ///
     /// # Errors
     /// As [`measure`](Self::measure), [`EvalError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a

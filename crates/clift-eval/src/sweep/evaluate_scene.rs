@@ -119,9 +119,8 @@ fn add_jobs<'a>(
                 renderer.warm_up(&all, metrics)?;
                 jobs.push(all);
                 let can_select = stored.model.network.supports_selection();
-                for num_render_tokens in
-                    render_counts(&sweep.render, num_storage_tokens).into_iter().filter(|_| can_select)
-                {
+                let counts = if can_select { render_counts(&sweep.render, num_storage_tokens) } else { Vec::new() };
+                for num_render_tokens in counts {
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
                     metrics.selection = Some(sweep.selection);

@@ -1,8 +1,8 @@
 //! Initial weights, sampled on the host: a seed gives the same network on every device.
 //!
 //! The distributions are PyTorch's: linear layers uniform in `+-1/sqrt(inputs)`, packed attention projections
-//! Xavier-uniform with zero bias. Networks without biases are LVSM's: all matrices are normal. All blocks of the released code start with the same weights; here every block has its
-//! own.
+//! Xavier-uniform with zero bias. The matrices of LVSM's network without biases are normal. All blocks of the released code
+//! start with the same weights; here every block has its own.
 
 use burn::module::Param;
 use burn::nn::{LayerNorm, LayerNormConfig, Linear, RmsNorm, RmsNormConfig};

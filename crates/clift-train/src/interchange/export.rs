@@ -126,7 +126,7 @@ fn export_f16(config: &Config, model: &ModelPath, folder: &Path) -> Result<Expor
     require_absent(folder)?;
     let trained = TrainedModel::open(model, &config.model, &DeviceName::default().open()?)?;
     let part = if trained.has_condenser { PathFilter::all() } else { Clift::stage1_part() };
-    publish_model_dir(folder, |written| {
+    let parameters = publish_model_dir(folder, |written| {
         save_part_f16(&trained.network, &part, &written.weights)?;
         for name in ["config.toml", "import.json"] {
             let path = model.dir.join(name);
@@ -135,9 +135,8 @@ fn export_f16(config: &Config, model: &ModelPath, folder: &Path) -> Result<Expor
                 write_file(&written.dir.join(name), &bytes)?;
             }
         }
-        Ok(())
+        read_parameters(&written.weights)
     })?;
-    let parameters = read_parameters(&folder.join("model.safetensors"))?;
     Ok(Exported {
         num_tensors: parameters.len(),
         num_values: parameters.values().map(|(_, values)| values.len()).sum(),

@@ -77,11 +77,12 @@ pub(crate) fn write_model_dir(
 
 const WRITING: &str = "writing the model directory";
 
-/// Makes a directory under a temporary name, has `fill` write its files, and renames it. Removes it on errors.
-pub(crate) fn publish_model_dir(
+/// Makes a directory under a temporary name, has `fill` write its files, and renames it. Removes it on errors. Returns the
+/// result of `fill`.
+pub(crate) fn publish_model_dir<T>(
     folder: &Path,
-    fill: impl FnOnce(&ModelPath) -> Result<(), TrainError>,
-) -> Result<(), TrainError> {
+    fill: impl FnOnce(&ModelPath) -> Result<T, TrainError>,
+) -> Result<T, TrainError> {
     if folder.file_name().is_none() {
         return Err(bad("-o", folder.display(), "write the name of a directory"));
     }
@@ -93,11 +94,12 @@ pub(crate) fn publish_model_dir(
     // Removed on drop.
     let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
     let temporary = temporary.map_err(TrainError::io(WRITING, above))?;
-    fill(&ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") })?;
+    let filled =
+        fill(&ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") })?;
     require_absent(folder)?;
     publish_folder(temporary.path(), folder).map_err(TrainError::io(WRITING, folder))?;
     let _ = temporary.keep(); // the directory was renamed
-    Ok(())
+    Ok(filled)
 }
 
 pub(crate) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), TrainError> {

@@ -37,7 +37,10 @@ pub(crate) fn init_from(
         return Err(TrainError::bad_file(what, path)(lack));
     }
     let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
-    loaded.unused.retain(|name| part.matches(name));
+    // The rest of the file is not lost where the other stage takes it.
+    if stage == Stage::Stage2 || config.stage2.init_from.is_some() {
+        loaded.unused.retain(|name| part.matches(name));
+    }
     sink.event(&Event::Message(format!(
         "loaded {} parameters from {}; initialized, not in the file: {}; unused in the file: {}",
         loaded.applied.len(),

@@ -71,8 +71,8 @@ impl<'a> Validation<'a> {
         Ok(Self { config, evaluator })
     }
 
-    /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with one count of condensed tokens in
-    /// stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB; `None` if no view could be measured
+    /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with
+    /// one count of condensed tokens in stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB; `None` if no view could be measured
     /// or `stop` is set.
     ///
     /// # Errors

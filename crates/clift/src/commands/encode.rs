@@ -122,7 +122,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let reader = ClipReader { source, options: config.data.clip_options() };
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then_some(context),
-        num_context: model_args.num_context(config.data.views.max_context, reader.source.num_frames(scene)?),
+        num_context: model_args.num_context(config.data.views.max_context, reader.source.as_ref(), scene..scene + 1)?,
         storage: TokenCount::Share(if config.model.has_latents() { 1.0 } else { 0.25 }),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),

@@ -93,10 +93,9 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let model_args = ModelArgs::find(scene, args.data.as_deref(), &args.overrides)?;
     let opened = model_args.open_data(args.split)?;
     let model = model_args.open()?;
-    let scenes = 0..opened.source.num_scenes().min(MAX_SCENES);
-    let lengths = scenes.map(|scene| opened.source.num_frames(scene));
-    let shortest = lengths.collect::<Result<Vec<_>, _>>()?.into_iter().min().unwrap_or_default();
-    let num_context = model_args.num_context(model_args.config.eval.num_context, shortest);
+    let source = opened.source.as_ref();
+    let scenes = 0..source.num_scenes().min(MAX_SCENES);
+    let num_context = model_args.num_context(model_args.config.eval.num_context, source, scenes)?;
     let ModelArgs { given, mut config, folder, .. } = model_args;
     require_places(&config.model, &given)?;
     config.eval.num_context = num_context;

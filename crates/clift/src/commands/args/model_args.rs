@@ -1,9 +1,12 @@
 //! A trained model with the data that a command reads: those of its run, or a folder.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use clift_data::{DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SourceKind, SourceOptions, Split};
-use clift_data::{open_dataset, open_source};
+use clift_data::{
+    DataError, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
+    open_dataset, open_source,
+};
 use clift_model::{CameraEncoding, ModelError, ModelPath, TrainedModel};
 use clift_train::{Config, Override};
 
@@ -73,12 +76,24 @@ impl ModelArgs {
         Ok(opened)
     }
 
-    /// Returns the default number of context views: `trained`, or for photos up to three times as many, one for every
-    /// fourth frame. With camera-relative attention, views beside those of training improve the renderings
-    /// (models/rooms/README.md).
-    pub fn num_context(&self, trained: usize, num_frames: usize) -> usize {
-        let takes_more = self.folder.is_some() && self.config.model.camera_encoding != CameraEncoding::Plucker;
-        if takes_more { (num_frames / 4).clamp(trained, 3 * trained) } else { trained }
+    /// Returns the default number of context views of these scenes: `trained`, as in training. Of scenes of a folder, a
+    /// network with camera-relative attention takes one for every fourth frame, up to three times as many as in training:
+    /// further views improve its renderings (models/rooms/README.md).
+    ///
+    /// # Errors
+    /// Those of counting the frames.
+    pub fn num_context(
+        &self,
+        trained: usize,
+        source: &dyn SceneSource,
+        scenes: Range<usize>,
+    ) -> Result<usize, DataError> {
+        if self.folder.is_none() || self.config.model.camera_encoding == CameraEncoding::Plucker {
+            return Ok(trained);
+        }
+        let lengths = scenes.map(|scene| source.num_frames(scene)).collect::<Result<Vec<_>, _>>()?;
+        let shortest = lengths.into_iter().min().unwrap_or_default();
+        Ok((shortest / 4).clamp(trained, 3 * trained))
     }
 
     /// Reads the weights.
