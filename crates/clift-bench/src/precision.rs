@@ -1,4 +1,4 @@
-//! `clift bench precision`: time and error of f16 products beside f32 products.
+//! `clift bench precision`: time and error of f16 or bf16 products beside f32 products.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -26,6 +26,8 @@ pub const PRECISION_CASES: [BenchCase; 4] =
 pub struct PrecisionReport {
     /// Device of the tensors.
     pub device: DeviceName,
+    /// What f32 is compared with.
+    pub precision: Precision,
     /// One row per case.
     pub rows: Vec<PrecisionRow>,
 }
@@ -38,31 +40,32 @@ pub struct PrecisionRow {
     pub case: BenchCase,
     /// Median seconds with f32 products.
     pub f32_s: f64,
-    /// Median seconds with f16 products; repetitions alternate between f32 and f16.
-    pub f16_s: f64,
-    /// `f16_s` over `f32_s`.
+    /// Median seconds with products in [`PrecisionReport::precision`]; repetitions alternate with those in f32.
+    pub reduced_s: f64,
+    /// `reduced_s` over `f32_s`.
     pub ratio: f64,
     /// Norm of the difference over the norm of the f32 result: tokens, images or the whole gradient of an update.
     pub error: f64,
-    /// Loss of an update in f32 and in f16.
+    /// Loss of an update in both precisions, f32 first.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub loss: Option<[f64; 2]>,
-    /// PSNR of f16 images against f32 images in dB.
+    /// PSNR of images against those of f32 in dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_to_f32: Option<f64>,
 }
 
 impl PrecisionRow {
-    /// Returns the PSNR of an update's renderings in dB, in f32 and in f16.
+    /// Returns the PSNR of an update's renderings in dB, in f32 first.
     pub fn psnr(&self) -> Option<[f64; 2]> {
         self.loss.map(|loss| loss.map(psnr_of_mse))
     }
 }
 
-/// Times the cases of `options` in both precisions, alternating, on the device of `config`, and compares their results.
+/// Times the cases of `options` in f32 and in the precision of `config` (f16 if this is f32), alternating, on its device,
+/// and compares their results.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for impossible sizes, [`clift_model::ModelError::BadConfig`] on a device without f16,
+/// [`TrainError::BadConfig`] for impossible sizes, [`clift_model::ModelError::BadConfig`] on a device without the precision,
 /// [`TrainError::Abandoned`] after `stop` was set.
 pub fn compare_precision(
     config: &Config,
@@ -73,15 +76,16 @@ pub fn compare_precision(
         let fix = format!("write some of {}", PRECISION_CASES.map(BenchCase::name).join(", "));
         return Err(TrainError::BadConfig { key: "--case".into(), value: other.name().into(), fix });
     }
-    let [single, f16] = [Precision::F32, Precision::F16]
-        .map(|precision| BenchContext::new(&Config { precision, ..config.clone() }, options));
-    let contexts = [single?, f16?];
+    let precision = if config.precision == Precision::F32 { Precision::F16 } else { config.precision };
+    let context = |precision| BenchContext::new(&Config { precision, ..config.clone() }, options);
+    let contexts = [context(Precision::F32)?, context(precision)?];
     let mut rows = Vec::new();
     for case in PRECISION_CASES.into_iter().filter(|case| options.cases.contains(case)) {
-        let [f32_s, f16_s] = median_times(case, &contexts, options, stop)?;
-        rows.push(PrecisionRow { f32_s, f16_s, ratio: f16_s / f32_s, ..compare_results(case, &contexts[0])? });
+        let [f32_s, reduced_s] = median_times(case, &contexts, options, stop)?;
+        let compared = compare_results(case, &contexts[0], precision)?;
+        rows.push(PrecisionRow { f32_s, reduced_s, ratio: reduced_s / f32_s, ..compared });
     }
-    Ok(PrecisionReport { device: config.device, rows })
+    Ok(PrecisionReport { device: config.device, precision, rows })
 }
 
 fn median_times(
@@ -115,43 +119,43 @@ fn median_times(
     Ok(samples.map(|samples| median(&samples)))
 }
 
-fn compare_results(case: BenchCase, context: &BenchContext) -> Result<PrecisionRow, TrainError> {
+fn compare_results(case: BenchCase, context: &BenchContext, reduced: Precision) -> Result<PrecisionRow, TrainError> {
     let both = |forward: &dyn Fn() -> Tensor<1>| {
-        [Precision::F32, Precision::F16].map(|precision| {
+        [Precision::F32, reduced].map(|precision| {
             let _scope = precision.scope();
             values(forward())
         })
     };
-    let row = PrecisionRow { case, f32_s: 0.0, f16_s: 0.0, ratio: 0.0, error: 0.0, loss: None, psnr_to_f32: None };
+    let row = PrecisionRow { case, f32_s: 0.0, reduced_s: 0.0, ratio: 0.0, error: 0.0, loss: None, psnr_to_f32: None };
     let stage = match case {
         BenchCase::Encode => {
             let encode = encode(context)?;
-            let [single, f16] = both(&|| encode.forward());
-            return Ok(PrecisionRow { error: relative_distance(&f16, &single), ..row });
+            let [single, reduced] = both(&|| encode.forward());
+            return Ok(PrecisionRow { error: relative_distance(&reduced, &single), ..row });
         }
         BenchCase::Render => {
             let render = render(context, 1)?;
-            let [single, f16] = both(&|| render.forward());
-            let squares = f16.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
+            let [single, reduced] = both(&|| render.forward());
+            let squares = reduced.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
             let mse = squares.sum::<f64>() / single.len() as f64;
             let psnr_to_f32 = Some(psnr_of_mse(mse));
-            return Ok(PrecisionRow { error: relative_distance(&f16, &single), psnr_to_f32, ..row });
+            return Ok(PrecisionRow { error: relative_distance(&reduced, &single), psnr_to_f32, ..row });
         }
         BenchCase::Stage2Step => Stage::Stage2,
         _ => Stage::Stage1,
     };
     let model = freeze(stage, context.model());
     let batch = micro_batch(context, stage)?;
-    let results = [Precision::F32, Precision::F16].map(|precision| -> Result<_, TrainError> {
+    let results = [Precision::F32, reduced].map(|precision| -> Result<_, TrainError> {
         let _scope = precision.scope();
         let device_batch = DeviceBatch::upload(&batch.clips, &context.device.clone().autodiff())?;
         let (loss, grads) = gradients(&model, &batch, device_batch)?;
         let factor = loss_factor();
         Ok((loss, flat_gradient(&model, &grads).into_iter().map(|value| value / factor).collect::<Vec<_>>()))
     });
-    let [single, f16] = results;
-    let ((single_loss, single), (f16_loss, f16)) = (single?, f16?);
-    Ok(PrecisionRow { error: relative_distance(&f16, &single), loss: Some([single_loss, f16_loss]), ..row })
+    let [single, reduced] = results;
+    let ((single_loss, single), (reduced_loss, reduced)) = (single?, reduced?);
+    Ok(PrecisionRow { error: relative_distance(&reduced, &single), loss: Some([single_loss, reduced_loss]), ..row })
 }
 
 /// Returns `|a - b| / |b|`, NaN if a value is NaN.
@@ -167,20 +171,28 @@ mod tests {
     use super::*;
     use crate::runner::tests::{config, options};
 
-    #[test]
-    fn every_row_is_close_to_f32_but_not_equal() {
-        let report = compare_precision(&config(DeviceName::Flex), &options(&PRECISION_CASES), &AtomicBool::new(false))
-            .expect("runs");
+    /// Compares all cases with f32; errors must be at most `largest`.
+    fn check(precision: Precision, largest: f64) {
+        let config = Config { precision, ..config(DeviceName::Flex) };
+        let report = compare_precision(&config, &options(&PRECISION_CASES), &AtomicBool::new(false)).expect("runs");
         assert_eq!(report.rows.iter().map(|row| row.case).collect::<Vec<_>>(), PRECISION_CASES);
         for row in &report.rows {
-            // Operands of 11 bits, through two blocks and back.
-            assert!(row.error > 1e-6 && row.error < 1e-2, "{row:?}");
+            assert!(row.error > 1e-6 && row.error < largest, "{row:?}");
             let is_step = matches!(row.case, BenchCase::Stage1Step | BenchCase::Stage2Step);
             assert_eq!((row.loss.is_some(), row.psnr_to_f32.is_some()), (is_step, row.case == BenchCase::Render));
-            if let Some([single, f16]) = row.psnr() {
-                assert!((single - f16).abs() < 0.01, "{row:?}");
+            if let Some([single, reduced]) = row.psnr() {
+                assert!((single - reduced).abs() < 0.01, "{row:?}");
             }
             assert!(row.psnr_to_f32.is_none_or(|psnr| psnr > 50.0), "{row:?}");
+        }
+    }
+
+    #[test]
+    fn every_row_is_close_to_f32_but_not_equal() {
+        // Operands of 11 bits, through two blocks and back.
+        check(Precision::F16, 1e-2);
+        if Precision::Bf16.check("precision", &DeviceName::Flex.open().unwrap()).is_ok() {
+            check(Precision::Bf16, 4e-2);
         }
         let refused =
             compare_precision(&config(DeviceName::Ndarray), &options(&PRECISION_CASES), &AtomicBool::new(false))

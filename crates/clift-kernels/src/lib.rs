@@ -27,13 +27,14 @@ mod gelu;
 mod head_transform;
 mod layer_norm;
 mod linear;
+mod matmul_bf16;
 mod primitives;
 mod simd;
 #[cfg(test)]
 mod testing;
 
 // Choice of the instruction set
-pub use simd::dispatch::{InstructionSet, InstructionSetError};
+pub use simd::dispatch::{InstructionSet, InstructionSetError, OperandType};
 // Softmax attention
 pub use attention::backward::{BackwardInputs, attention_backward};
 pub use attention::forward::attention_forward;
@@ -46,3 +47,4 @@ pub use head_transform::{HeadTransform, transform_heads, transform_len};
 pub use gelu::{gelu_backward, gelu_forward};
 pub use layer_norm::{layer_norm_backward, layer_norm_forward, sum_rows};
 pub use linear::linear_forward;
+pub use matmul_bf16::{Matrix, matmul_bf16};

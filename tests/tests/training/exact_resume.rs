@@ -1,5 +1,6 @@
 //! A run killed at a chosen step and resumed ends with the files of an undisturbed run, bit for bit.
 
+use clift_model::InstructionSet;
 use serde_json::{Value, json};
 
 use crate::support::{Place, Shared, list, number};
@@ -52,6 +53,26 @@ fn f16_training_resumes_with_its_loss_scale() {
     place
         .train("refused --device ndarray", &["precision=\"f16\""])
         .fails_with(2, &["`precision` = f16: the device has no f16"]);
+}
+
+#[test]
+fn bf16_training_resumes_exactly_or_is_refused_before_work() {
+    let place = Place::new();
+    let set: Vec<&str> = THIRTY.iter().copied().chain(["precision=\"bf16\"", "eval.precision=\"bf16\""]).collect();
+    if !InstructionSet::detected().has_bf16() {
+        place.train("whole", &set).fails_with(2, &["`precision` = bf16: the kernels have no bf16 instructions"]);
+        return;
+    }
+    place.train("whole", &set).ok();
+    place.kill_at("step/stage1/25", "parts", &set);
+    place.train("parts", &set).ok();
+    place.assert_same_run("parts", "whole");
+    let state = place.json("whole/stage2/checkpoints/step-000000030/state.json");
+    assert!(state.get("loss_scale").is_none_or(Value::is_null), "the range of f32 needs no loss scaling");
+    let last_loss = |run: &str| number(place.metrics(run).last().expect("a step"), "loss");
+    place.copy(&UNDISTURBED, "single");
+    let apart = (last_loss("whole") / last_loss("single") - 1.0).abs();
+    assert!(apart > 0.0 && apart < 0.05, "operands round, and training goes where it went: {apart}");
 }
 
 #[test]

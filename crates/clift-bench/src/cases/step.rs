@@ -49,6 +49,7 @@ pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
         device: context.device.clone().autodiff(),
         loss: Loss::default(),
         activation_checkpointing: context.config.activation_checkpointing,
+        precision: context.config.precision,
         loss_scale: LossScale::of(context.config.precision),
     }
 }

@@ -48,7 +48,7 @@ pub struct EvalConfig {
     pub num_validation_scenes: usize,
     /// Token count of a stage-2 validation.
     pub validation_storage: TokenCount,
-    /// Precision of matrix products in encoder, condenser and renderer: `f32` or `f16`. K-means is always f32.
+    /// Precision of matrix products in encoder, condenser and renderer: `f32`, `bf16` or `f16`. K-means is always f32.
     pub precision: Precision,
 }
 

@@ -4,14 +4,13 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::attention::shapes::{
-    AttentionGradients, AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows, copy_padded, copy_transposed,
-};
+use crate::attention::shapes::{AttentionGradients, AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
+use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
-use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::Simd;
+use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
+use crate::simd::vector::{Operands, Simd};
 
 /// Keys per block: a task holds a block of scores and one of their gradients.
 const BACKWARD_KEYS: usize = 256;
@@ -37,9 +36,11 @@ pub struct BackwardInputs<'a> {
 /// Computes the gradients of queries, keys and values.
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`,
-/// `dK = s dS^T Q`. The scores are computed again, a block at a time.
+/// `dK = s dS^T Q`. The scores are computed again, a block at a time. Operands of the products have the type `operands`,
+/// that of the forward pass.
 pub fn attention_backward(
     set: InstructionSet,
+    operands: OperandType,
     sizes: AttentionSizes,
     inputs: BackwardInputs<'_>,
     gradients: AttentionGradients<'_>,
@@ -52,14 +53,14 @@ pub fn attention_backward(
             assert!(packed.len() == batch * num_queries * 3 * dim && num_keys == num_queries);
             let packed = SharedSlice::new(packed);
             let part = |part| HeadBlocks { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
-            backward_into(set, sizes, inputs, [part(0), part(1), part(2)]);
+            backward_into(set, operands, sizes, inputs, [part(0), part(1), part(2)]);
         }
         AttentionGradients::Separate { query, key_value } => {
             assert!(query.len() == batch * num_queries * dim && key_value.len() == batch * num_keys * 2 * dim);
             let (query, key_value) = (SharedSlice::new(query), SharedSlice::new(key_value));
             let part = |part| HeadBlocks { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
             let query = HeadBlocks { values: &query, count: num_queries, width: dim, first: 0 };
-            backward_into(set, sizes, inputs, [query, part(0), part(1)]);
+            backward_into(set, operands, sizes, inputs, [query, part(0), part(1)]);
         }
     }
 }
@@ -67,6 +68,7 @@ pub fn attention_backward(
 /// Writes the gradients to three parts, which must not overlap.
 fn backward_into(
     set: InstructionSet,
+    operands: OperandType,
     sizes: AttentionSizes,
     inputs: BackwardInputs<'_>,
     [grad_query, grad_key, grad_value]: [HeadBlocks<'_>; 3],
@@ -80,7 +82,7 @@ fn backward_into(
         .map(|task| {
             let (head, part) = (task / parts, task % parts);
             let bound = |part: usize| (part * blocks / parts * BACKWARD_KEYS).min(num_keys);
-            set.run(BackwardTask {
+            let task = BackwardTask {
                 sizes,
                 inputs,
                 grad_key,
@@ -88,7 +90,8 @@ fn backward_into(
                 scene: head / num_heads,
                 head: head % num_heads,
                 keys: bound(part)..bound(part + 1),
-            })
+            };
+            set.run_product(operands, task)
         })
         .collect();
     (0..sizes.batch * num_heads).into_par_iter().for_each(|head| {
@@ -113,84 +116,110 @@ struct BackwardTask<'a> {
     keys: Range<usize>,
 }
 
-impl<'a> Kernel for BackwardTask<'a> {
+impl<'a> ProductKernel for BackwardTask<'a> {
     /// Unscaled gradients of all queries from the task's keys, in rows of the padded head width.
     type Output = Vec<f32>;
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> Vec<f32> {
+    fn run<S: Simd, O: Operands>(self, simd: S) -> Vec<f32> {
         let Self { sizes, inputs, grad_key, grad_value, scene, head, keys } = self;
         let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
-        let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
+        let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
         let block = num_keys.min(BACKWARD_KEYS);
         let score_row = block.next_multiple_of(panel) + ROW_PADDING;
+        // Values of f32 have the same layout along as across.
+        let only_pairs = |len: usize| if O::PER_LANE > 1 { len } else { 0 };
         let lens = [
-            num_queries * width,
-            num_queries * width,
+            only_pairs(num_queries * inner),
+            only_pairs(num_queries * inner),
+            lanes_of::<O>(num_queries) * width,
+            lanes_of::<O>(num_queries) * width,
             num_queries,
-            block.next_multiple_of(panel) * head_width,
-            block.next_multiple_of(panel) * head_width,
-            block * width,
+            block.next_multiple_of(panel) * inner,
+            block.next_multiple_of(panel) * inner,
+            lanes_of::<O>(block) * width,
             block * width,
             block * width,
             QUERY_BLOCK * score_row,
             QUERY_BLOCK * score_row,
+            only_pairs(lanes_of::<O>(QUERY_BLOCK) * score_row),
         ];
         let mut grad_query = vec![0.0; num_queries * width];
-        let head_of = |rows: &StridedRows<'a>, row: usize| rows.head(&sizes, scene, row, head);
+        let rows_of =
+            |rows: StridedRows<'a>, range: Range<usize>| range.map(move |row| rows.head(&sizes, scene, row, head));
         let mut scratch = Scratch::take(lens.iter().sum());
-        let [queries, grads, delta, keys_t, values_t, key_rows, key_sums, value_sums, weights, slopes] =
-            scratch.cut(lens);
-        copy_padded(queries, width, (0..num_queries).map(|row| head_of(&inputs.query, row)));
-        copy_padded(grads, width, (0..num_queries).map(|row| head_of(&inputs.grad_output, row)));
-        for (row, to) in delta.iter_mut().enumerate() {
-            let pairs = head_of(&inputs.output, row).iter().zip(head_of(&inputs.grad_output, row));
-            *to = pairs.map(|(a, b)| a * b).sum();
+        let [
+            queries,
+            grads,
+            queries_across,
+            grads_across,
+            delta,
+            keys_t,
+            values_t,
+            keys_across,
+            key_sums,
+            value_sums,
+            weights,
+            slopes,
+            across,
+        ] = scratch.cut(lens);
+        pack_across::<S, O>(simd, rows_of(inputs.query, 0..num_queries), width, queries_across);
+        pack_across::<S, O>(simd, rows_of(inputs.grad_output, 0..num_queries), width, grads_across);
+        let (queries, grads, query_row) = if O::PER_LANE > 1 {
+            pack_rows::<S, O>(simd, rows_of(inputs.query, 0..num_queries), inner, queries);
+            pack_rows::<S, O>(simd, rows_of(inputs.grad_output, 0..num_queries), inner, grads);
+            (&*queries, &*grads, inner)
+        } else {
+            (&*queries_across, &*grads_across, width)
+        };
+        let outputs = rows_of(inputs.output, 0..num_queries).zip(rows_of(inputs.grad_output, 0..num_queries));
+        for (to, (output, grad)) in delta.iter_mut().zip(outputs) {
+            *to = output.iter().zip(grad).map(|(a, b)| a * b).sum();
         }
         let log_sum = &inputs.log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
         for first_key in keys.clone().step_by(BACKWARD_KEYS) {
             let count = BACKWARD_KEYS.min(keys.end - first_key);
             let rows = first_key..first_key + count;
-            copy_transposed(keys_t, panel, head_width, rows.clone().map(|row| head_of(&inputs.key, row)));
-            copy_transposed(values_t, panel, head_width, rows.clone().map(|row| head_of(&inputs.value, row)));
-            copy_padded(key_rows, width, rows.clone().map(|row| head_of(&inputs.key, row)));
+            pack_transposed::<S, O>(simd, rows_of(inputs.key, rows.clone()), [inner, panel], keys_t);
+            pack_transposed::<S, O>(simd, rows_of(inputs.value, rows.clone()), [inner, panel], values_t);
+            pack_across::<S, O>(simd, rows_of(inputs.key, rows), width, keys_across);
             key_sums.fill(0.0);
             value_sums.fill(0.0);
             for start in (0..num_queries).step_by(QUERY_BLOCK) {
                 let rows = QUERY_BLOCK.min(num_queries - start);
-                let (query, grad) = (&queries[start * width..], &grads[start * width..]);
-                let transposed = |values| Right { values, step: panel, panel: panel * head_width };
-                let by_row = |values| Left { values, row: width, step: 1 };
-                let size = [rows, head_width, count];
-                multiply(simd, size, by_row(query), transposed(keys_t), (weights, score_row), false);
-                multiply(simd, size, by_row(grad), transposed(values_t), (slopes, score_row), false);
+                let first_lane = lanes_of::<O>(start) * width;
+                let size = [rows, inner, count];
+                let left = |values| Left { values, row: query_row, step: 1 };
+                let right = |values| Right { values, step: panel, panel: panel * inner };
+                let (query, grad) = (&queries[start * query_row..], &grads[start * query_row..]);
+                multiply::<S, O>(simd, size, left(query), right(keys_t), (weights, score_row), false);
+                multiply::<S, O>(simd, size, left(grad), right(values_t), (slopes, score_row), false);
                 for row in 0..rows {
                     let range = row * score_row..row * score_row + padded::<S>(count);
-                    score_gradients(
-                        simd,
-                        (&mut weights[range.clone()], &mut slopes[range]),
-                        sizes.scale() * std::f32::consts::LOG2_E,
-                        log_sum[start + row],
-                        delta[start + row],
-                    );
+                    let pair = (&mut weights[range.clone()], &mut slopes[range]);
+                    score_gradients(simd, pair, sizes.scale(), log_sum[start + row], delta[start + row]);
                 }
-                let by_key = |values| Left { values, row: 1, step: score_row };
-                let plain = |values| Right { values, step: width, panel };
-                let size = [count, rows, head_width];
-                multiply(simd, size, by_key(weights), plain(grad), (value_sums, width), true);
-                multiply(simd, size, by_key(slopes), plain(query), (key_sums, width), true);
-                let by_query = Left { values: slopes, row: score_row, step: 1 };
+                let size = [count, lanes_of::<O>(rows), head_width];
+                let right = |values| Right { values, step: width, panel };
+                let (query, grad) = (&queries_across[first_lane..], &grads_across[first_lane..]);
+                let left = by_key::<S, O>(simd, weights, [rows, count, score_row], across);
+                multiply::<S, O>(simd, size, left, right(grad), (value_sums, width), true);
+                let left = by_key::<S, O>(simd, slopes, [rows, count, score_row], across);
+                multiply::<S, O>(simd, size, left, right(query), (key_sums, width), true);
+                for row in 0..rows {
+                    pack_in_place::<S, O>(simd, &mut slopes[row * score_row..][..count]);
+                }
+                let left = Left { values: slopes, row: score_row, step: 1 };
+                let size = [rows, lanes_of::<O>(count), head_width];
                 let to = (&mut grad_query[start * width..], width);
-                multiply(simd, [rows, count, head_width], by_query, plain(key_rows), to, true);
+                multiply::<S, O>(simd, size, left, right(keys_across), to, true);
             }
-            for row in 0..count {
+            for (row, (keys, values)) in key_sums.chunks(width).zip(value_sums.chunks(width)).take(count).enumerate() {
                 let index = [scene, first_key + row, head];
-                let key_row = key_sums[row * width..][..head_width].iter().map(|sum| sum * sizes.scale());
-                let value_row = value_sums[row * width..][..head_width].iter().copied();
                 // SAFETY: no other task has this key of this head.
                 unsafe {
-                    grad_key.write(index, key_row);
-                    grad_value.write(index, value_row);
+                    grad_key.write(index, keys[..head_width].iter().map(|sum| sum * sizes.scale()));
+                    grad_value.write(index, values[..head_width].iter().copied());
                 }
             }
         }
@@ -198,9 +227,28 @@ impl<'a> Kernel for BackwardTask<'a> {
     }
 }
 
+/// Returns `values[rows, count]`, in rows of `stride` values, as a transposed left factor; pairs are packed into `across`.
+#[inline(always)]
+fn by_key<'v, S: Simd, O: Operands>(
+    simd: S,
+    values: &'v [f32],
+    [rows, count, stride]: [usize; 3],
+    across: &'v mut [f32],
+) -> Left<'v> {
+    let values = if O::PER_LANE > 1 {
+        let rows = values.chunks(stride).take(rows).map(|row| &row[..count]);
+        pack_across::<S, O>(simd, rows, stride, across);
+        across
+    } else {
+        values
+    };
+    Left { values, row: 1, step: stride }
+}
+
 /// Replaces a row of scores by the weights `P`, and the row of the weights' gradients by the scores' gradients.
 #[inline(always)]
 fn score_gradients<S: Simd>(simd: S, (scores, slopes): (&mut [f32], &mut [f32]), scale: f32, log_sum: f32, delta: f32) {
+    let scale = scale * std::f32::consts::LOG2_E;
     let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
     for (score, slope) in scores.chunks_exact_mut(S::LANES).zip(slopes.chunks_exact_mut(S::LANES)) {
         let weight = simd.exp2(simd.mul_add(simd.read(score), factor, shift));

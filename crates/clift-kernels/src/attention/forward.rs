@@ -4,19 +4,18 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::attention::shapes::{
-    AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows, copy_padded, copy_transposed,
-};
+use crate::attention::shapes::{AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
+use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
-use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::Simd;
+use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
+use crate::simd::vector::{Operands, Simd};
 
 /// Keys per block: the scores of a block take 200 KB.
 const FORWARD_KEYS: usize = 512;
 
-/// Computes `softmax(q k^T / sqrt(head width)) v` per head.
+/// Computes `softmax(q k^T / sqrt(head width)) v` per head; operands of the products have the type `operands`.
 ///
 /// # Shapes
 /// - `output`: `[batch, num_queries, dim]`
@@ -24,6 +23,7 @@ const FORWARD_KEYS: usize = 512;
 ///   an input of [`attention_backward`](crate::attention_backward)
 pub fn attention_forward(
     set: InstructionSet,
+    operands: OperandType,
     sizes: AttentionSizes,
     [query, key, value]: [StridedRows<'_>; 3],
     output: &mut [f32],
@@ -42,7 +42,7 @@ pub fn attention_forward(
     (0..sizes.batch * sizes.num_heads * parts).into_par_iter().for_each(|task| {
         let (head, part) = (task / parts, task % parts);
         let bound = |part: usize| (part * blocks / parts * QUERY_BLOCK).min(sizes.num_queries);
-        set.run(Forward {
+        let task = Forward {
             sizes,
             inputs: [query, key, value],
             output,
@@ -50,7 +50,8 @@ pub fn attention_forward(
             scene: head / sizes.num_heads,
             head: head % sizes.num_heads,
             queries: bound(part)..bound(part + 1),
-        });
+        };
+        set.run_product(operands, task);
     });
 }
 
@@ -64,19 +65,19 @@ struct Forward<'a> {
     queries: Range<usize>,
 }
 
-impl Kernel for Forward<'_> {
+impl<'a> ProductKernel for Forward<'a> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { sizes, inputs: [query, key, value], output, log_sum, scene, head, queries } = self;
         let AttentionSizes { num_keys, head_width, .. } = sizes;
-        let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
+        let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
         let score_row = num_keys.min(FORWARD_KEYS).next_multiple_of(panel) + ROW_PADDING;
         let lens = [
-            num_keys.next_multiple_of(panel) * head_width,
-            num_keys * width,
-            QUERY_BLOCK * head_width,
+            num_keys.next_multiple_of(panel) * inner,
+            lanes_of::<O>(num_keys) * width,
+            QUERY_BLOCK * inner,
             QUERY_BLOCK * score_row,
             QUERY_BLOCK * width,
             QUERY_BLOCK,
@@ -84,34 +85,33 @@ impl Kernel for Forward<'_> {
         ];
         let mut scratch = Scratch::take(lens.iter().sum());
         let [keys, values, block, scores, sums, highest, total] = scratch.cut(lens);
-        copy_transposed(keys, panel, head_width, (0..num_keys).map(|row| key.head(&sizes, scene, row, head)));
-        copy_padded(values, width, (0..num_keys).map(|row| value.head(&sizes, scene, row, head)));
+        let rows_of =
+            |rows: StridedRows<'a>, range: Range<usize>| range.map(move |row| rows.head(&sizes, scene, row, head));
+        pack_transposed::<S, O>(simd, rows_of(key, 0..num_keys), [inner, panel], keys);
+        pack_across::<S, O>(simd, rows_of(value, 0..num_keys), width, values);
         for start in queries.clone().step_by(QUERY_BLOCK) {
             let rows = QUERY_BLOCK.min(queries.end - start);
-            copy_padded(block, head_width, (start..start + rows).map(|row| query.head(&sizes, scene, row, head)));
+            pack_rows::<S, O>(simd, rows_of(query, start..start + rows), inner, block);
             sums.fill(0.0);
             highest.fill(f32::NEG_INFINITY);
             total.fill(0.0);
             for first_key in (0..num_keys).step_by(FORWARD_KEYS) {
                 let count = FORWARD_KEYS.min(num_keys - first_key);
-                let left = Left { values: block, row: head_width, step: 1 };
-                let right = Right { values: &keys[first_key * head_width..], step: panel, panel: panel * head_width };
-                multiply(simd, [rows, head_width, count], left, right, (scores, score_row), false);
+                let left = Left { values: block, row: inner, step: 1 };
+                let right = Right { values: &keys[first_key * inner..], step: panel, panel: panel * inner };
+                multiply::<S, O>(simd, [rows, inner, count], left, right, (scores, score_row), false);
                 for row in 0..rows {
-                    let shrink = exponentials(
-                        simd,
-                        &mut scores[row * score_row..][..count],
-                        sizes.scale() * std::f32::consts::LOG2_E,
-                        &mut highest[row],
-                        &mut total[row],
-                    );
+                    let scores = &mut scores[row * score_row..][..count];
+                    let scale_of_base_2 = sizes.scale() * std::f32::consts::LOG2_E;
+                    let shrink = exponentials(simd, scores, scale_of_base_2, &mut highest[row], &mut total[row]);
+                    pack_in_place::<S, O>(simd, scores);
                     if shrink != 1.0 {
                         scale(simd, &mut sums[row * width..][..width], shrink);
                     }
                 }
                 let left = Left { values: scores, row: score_row, step: 1 };
-                let right = Right { values: &values[first_key * width..], step: width, panel };
-                multiply(simd, [rows, count, head_width], left, right, (sums, width), true);
+                let right = Right { values: &values[lanes_of::<O>(first_key) * width..], step: width, panel };
+                multiply::<S, O>(simd, [rows, lanes_of::<O>(count), head_width], left, right, (sums, width), true);
             }
             for row in 0..rows {
                 let result = sums[row * width..][..head_width].iter().map(|sum| sum / total[row]);

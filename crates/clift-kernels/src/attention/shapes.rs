@@ -93,34 +93,3 @@ impl HeadBlocks<'_> {
 pub(crate) const QUERY_BLOCK: usize = 96;
 /// Padding of a row of scores: rows a power of two apart would share cache sets.
 pub(crate) const ROW_PADDING: usize = 16;
-
-/// Copies rows one after the other, each followed by zeros up to `width`.
-#[inline(always)]
-pub(crate) fn copy_padded<'a>(to: &mut [f32], width: usize, rows: impl Iterator<Item = &'a [f32]>) {
-    for (to, row) in to.chunks_exact_mut(width).zip(rows) {
-        to[..row.len()].copy_from_slice(row);
-        to[row.len()..].fill(0.0);
-    }
-}
-
-/// Copies rows as columns of panels: a panel is `[head_width, panel]`, the last one padded with zeros.
-#[inline(always)]
-pub(crate) fn copy_transposed<'a>(
-    to: &mut [f32],
-    panel: usize,
-    head_width: usize,
-    mut rows: impl ExactSizeIterator<Item = &'a [f32]>,
-) {
-    for to in to.chunks_exact_mut(panel * head_width) {
-        let columns = panel.min(rows.len());
-        if columns < panel {
-            to.fill(0.0);
-        }
-        for column in 0..columns {
-            let row = rows.next().expect("the iterator reports its length");
-            for (to, &value) in to[column..].iter_mut().step_by(panel).zip(row) {
-                *to = value;
-            }
-        }
-    }
-}

@@ -1,7 +1,7 @@
 //! Products of matrices that stay in the cache, the building block of attention.
 // M rows, K inner, N columns
 
-use crate::simd::vector::{Simd, Tile};
+use crate::simd::vector::{Operands, Simd, Tile};
 
 /// The left factor, a strided matrix in a slice.
 #[derive(Clone, Copy)]
@@ -33,10 +33,10 @@ pub(crate) fn padded<S: Simd>(columns: usize) -> usize {
     columns.next_multiple_of(S::LANES)
 }
 
-/// Computes `C[rows, columns] = A[rows, inner] B[inner, columns]`, or adds the product to C. Whole vectors of columns are
-/// computed: B and C must have [`padded`] columns.
+/// Computes `C[rows, columns] = A[rows, inner] B[inner, columns]`, or adds the product to C, with `inner` counted in lanes.
+/// Whole vectors of columns are computed: B and C must have [`padded`] columns.
 #[inline(always)]
-pub(crate) fn multiply<S: Simd>(
+pub(crate) fn multiply<S: Simd, O: Operands>(
     simd: S,
     [rows, inner, columns]: [usize; 3],
     a: Left<'_>,
@@ -71,7 +71,7 @@ pub(crate) fn multiply<S: Simd>(
                     c_row,
                     accumulate,
                 };
-                row += run_tile(simd, tile, rows - row, vectors);
+                row += run_tile::<S, O>(simd, tile, rows - row, vectors);
             }
         }
     }
@@ -82,30 +82,30 @@ pub(crate) fn multiply<S: Simd>(
 /// # Safety
 /// As [`Tile::run`].
 #[inline(always)]
-unsafe fn run_tile<S: Simd>(simd: S, tile: Tile, rows: usize, vectors: usize) -> usize {
+unsafe fn run_tile<S: Simd, O: Operands>(simd: S, tile: Tile, rows: usize, vectors: usize) -> usize {
     // SAFETY: by the caller's promise.
     unsafe {
         if vectors == S::TILE_VECTORS {
             if rows >= S::TILE_ROWS {
-                simd.full_tile(tile);
+                simd.full_tile::<O>(tile);
                 return S::TILE_ROWS;
             }
             if rows >= 4 {
-                tile.run_vectors::<S, 4>(simd);
+                tile.run_vectors::<S, O, 4>(simd);
                 return 4;
             }
-            tile.run_vectors::<S, 1>(simd);
+            tile.run_vectors::<S, O, 1>(simd);
             return 1;
         }
         if rows >= 8 {
-            tile.run::<S, 8, 1>(simd);
+            tile.run::<S, O, 8, 1>(simd);
             return 8;
         }
         if rows >= 4 {
-            tile.run::<S, 4, 1>(simd);
+            tile.run::<S, O, 4, 1>(simd);
             return 4;
         }
-        tile.run::<S, 1, 1>(simd);
+        tile.run::<S, O, 1, 1>(simd);
         1
     }
 }

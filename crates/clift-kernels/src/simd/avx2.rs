@@ -1,7 +1,7 @@
 //! AVX2 and FMA vectors.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx2` proves that the processor has AVX2 and FMA")]
 
-use crate::simd::vector::{Simd, Tile, binary_intrinsics};
+use crate::simd::vector::{Operands, Simd, Tile, binary_intrinsics};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
@@ -81,7 +81,7 @@ impl Simd for Avx2 {
         }
     }
     #[inline(always)]
-    unsafe fn full_tile(self, tile: Tile) {
-        unsafe { tile.run::<Self, 6, 2>(self) }
+    unsafe fn full_tile<O: Operands>(self, tile: Tile) {
+        unsafe { tile.run::<Self, O, 6, 2>(self) }
     }
 }

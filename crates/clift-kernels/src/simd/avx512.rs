@@ -1,26 +1,39 @@
-//! AVX-512 vectors.
+//! AVX-512 vectors, with and without bf16.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx512` proves that the processor has AVX-512")]
 
-use crate::simd::vector::{Simd, Tile, binary_intrinsics};
+use crate::simd::emulation;
+use crate::simd::vector::{Operands, Simd, Tile, binary_intrinsics};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
 
 /// AVX-512: 16 lanes, 32 registers.
 #[derive(Clone, Copy, Debug)]
-pub struct Avx512(());
+pub struct Avx512<const BF16: bool>(());
 
-impl Avx512 {
+impl<const BF16: bool> Avx512<BF16> {
     /// Creates the proof that the processor has the instructions.
     ///
     /// # Safety
-    /// The processor must have AVX-512 F, VL, BW and DQ.
+    /// The processor must have AVX-512 F, VL, BW and DQ, and BF16 if `BF16`.
     pub unsafe fn new() -> Self {
         Self(())
     }
 }
 
-impl Simd for Avx512 {
+/// Positions in two halves of 16 values each, alternating between the halves.
+const ALTERNATING: [i16; 32] = {
+    let mut order = [0; 32];
+    let mut lane = 0;
+    while lane < 16 {
+        order[2 * lane as usize] = lane;
+        order[2 * lane as usize + 1] = lane + 16;
+        lane += 1;
+    }
+    order
+};
+
+impl<const BF16: bool> Simd for Avx512<BF16> {
     const LANES: usize = 16;
     const TILE_ROWS: usize = 12;
     const TILE_VECTORS: usize = 2;
@@ -70,7 +83,36 @@ impl Simd for Avx512 {
         unsafe { _mm512_reduce_max_ps(a) }
     }
     #[inline(always)]
-    unsafe fn full_tile(self, tile: Tile) {
-        unsafe { tile.run::<Self, 12, 2>(self) }
+    fn pairs(self, first: __m512, second: __m512) -> __m512 {
+        if !BF16 {
+            return emulation::pairs(self, first, second);
+        }
+        unsafe {
+            let both = _mm512_cvtne2ps_pbh(second, first);
+            let order = _mm512_loadu_epi16(ALTERNATING.as_ptr());
+            let pairs = _mm512_permutexvar_epi16(order, std::mem::transmute::<__m512bh, __m512i>(both));
+            _mm512_castsi512_ps(pairs)
+        }
+    }
+    #[inline(always)]
+    fn pairs_of_neighbours(self, first: __m512, second: __m512) -> __m512 {
+        if !BF16 {
+            return emulation::pairs_of_neighbours(self, first, second);
+        }
+        unsafe { std::mem::transmute::<__m512bh, __m512>(_mm512_cvtne2ps_pbh(second, first)) }
+    }
+    #[inline(always)]
+    fn dot_pairs(self, a: __m512, b: __m512, sum: __m512) -> __m512 {
+        if !BF16 {
+            return emulation::dot_pairs(self, a, b, sum);
+        }
+        unsafe {
+            let a = std::mem::transmute::<__m512, __m512bh>(a);
+            _mm512_dpbf16_ps(sum, a, std::mem::transmute::<__m512, __m512bh>(b))
+        }
+    }
+    #[inline(always)]
+    unsafe fn full_tile<O: Operands>(self, tile: Tile) {
+        unsafe { tile.run::<Self, O, 12, 2>(self) }
     }
 }

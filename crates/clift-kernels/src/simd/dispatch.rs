@@ -1,10 +1,11 @@
 //! The choice of the instruction set, and running a kernel with it.
 
 use std::fmt;
+use std::marker::PhantomData;
 use std::sync::OnceLock;
 
 use crate::simd::portable::Portable;
-use crate::simd::vector::Simd;
+use crate::simd::vector::{Bf16, F32, Operands, Simd};
 
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{avx2::Avx2, avx512::Avx512};
@@ -18,6 +19,8 @@ pub enum InstructionSet {
     Avx2,
     /// x86-64 with AVX-512 F, VL, BW and DQ.
     Avx512,
+    /// The same and AVX-512 BF16.
+    Avx512Bf16,
 }
 
 /// An invalid value of [`InstructionSet::VARIABLE`].
@@ -45,11 +48,37 @@ pub(crate) trait Kernel {
     fn run<S: Simd>(self, simd: S) -> Self::Output;
 }
 
+/// Type of the operands of matrix products; sums are f32.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OperandType {
+    /// f32, as they are.
+    F32,
+    /// Rounded to bf16. Fast where [`InstructionSet::has_bf16`].
+    Bf16,
+}
+
+/// A [`Kernel`] that is generic over the operands of its products too.
+pub(crate) trait ProductKernel {
+    type Output;
+    fn run<S: Simd, O: Operands>(self, simd: S) -> Self::Output;
+}
+
+struct WithOperands<K, O>(K, PhantomData<O>);
+
+impl<K: ProductKernel, O: Operands> Kernel for WithOperands<K, O> {
+    type Output = K::Output;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> K::Output {
+        self.0.run::<S, O>(simd)
+    }
+}
+
 impl InstructionSet {
     /// All instruction sets, widest first.
-    pub const ALL: [Self; 3] = [Self::Avx512, Self::Avx2, Self::Portable];
+    pub const ALL: [Self; 4] = [Self::Avx512Bf16, Self::Avx512, Self::Avx2, Self::Portable];
 
-    /// Environment variable that forces an instruction set: `avx512`, `avx2` or `portable`.
+    /// Environment variable that forces an instruction set: `avx512-bf16`, `avx512`, `avx2` or `portable`.
     pub const VARIABLE: &str = "CLIFT_INSTRUCTION_SET";
 
     /// Returns the set that [`InstructionSet::VARIABLE`] forces, or else the widest available. The variable is read once
@@ -95,6 +124,7 @@ impl InstructionSet {
             Self::Portable => "portable",
             Self::Avx2 => "avx2",
             Self::Avx512 => "avx512",
+            Self::Avx512Bf16 => "avx512-bf16",
         }
     }
 
@@ -111,8 +141,26 @@ impl InstructionSet {
                     && is_x86_feature_detected!("avx512dq")
                     && Self::Avx2.is_available()
             }
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16 => is_x86_feature_detected!("avx512bf16") && Self::Avx512.is_available(),
             #[cfg(not(target_arch = "x86_64"))]
-            Self::Avx2 | Self::Avx512 => false,
+            Self::Avx2 | Self::Avx512 | Self::Avx512Bf16 => false,
+        }
+    }
+
+    /// Whether the set has instructions for products of bf16 values; the others emulate them, many times slower than f32.
+    pub fn has_bf16(self) -> bool {
+        self == Self::Avx512Bf16
+    }
+
+    /// Runs a kernel compiled for this instruction set and these operands, on this thread.
+    ///
+    /// # Panics
+    /// As [`InstructionSet::run`].
+    pub(crate) fn run_product<K: ProductKernel>(self, operands: OperandType, kernel: K) -> K::Output {
+        match operands {
+            OperandType::F32 => self.run(WithOperands::<K, F32>(kernel, PhantomData)),
+            OperandType::Bf16 => self.run(WithOperands::<K, Bf16>(kernel, PhantomData)),
         }
     }
 
@@ -130,8 +178,11 @@ impl InstructionSet {
             // SAFETY: checked above.
             #[cfg(target_arch = "x86_64")]
             Self::Avx512 => unsafe { run_avx512(kernel) },
+            // SAFETY: checked above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16 => unsafe { run_avx512_bf16(kernel) },
             #[cfg(not(target_arch = "x86_64"))]
-            Self::Avx2 | Self::Avx512 => unreachable!("not available"),
+            Self::Avx2 | Self::Avx512 | Self::Avx512Bf16 => unreachable!("not available"),
         }
     }
 }
@@ -147,7 +198,14 @@ fn run_avx2<K: Kernel>(kernel: K) -> K::Output {
 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
 fn run_avx512<K: Kernel>(kernel: K) -> K::Output {
     // SAFETY: this function is only called on a processor with these instructions.
-    kernel.run(unsafe { Avx512::new() })
+    kernel.run(unsafe { Avx512::<false>::new() })
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512bf16,avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
+fn run_avx512_bf16<K: Kernel>(kernel: K) -> K::Output {
+    // SAFETY: this function is only called on a processor with these instructions.
+    kernel.run(unsafe { Avx512::<true>::new() })
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 //! - `vector`: the trait `Simd` and the register tile of matrix products
 //! - `portable`: vectors in plain Rust
 //! - `avx2`: AVX2 and FMA
-//! - `avx512`: AVX-512
+//! - `avx512`: AVX-512, with and without bf16
+//! - `emulation`: bf16 without instructions for it
 //! - `dispatch`: the choice of the instruction set, and running a kernel with it
 
 #[cfg(target_arch = "x86_64")]
@@ -11,5 +12,6 @@ pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
 pub(crate) mod dispatch;
+pub(crate) mod emulation;
 pub(crate) mod portable;
 pub(crate) mod vector;

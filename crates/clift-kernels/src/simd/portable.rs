@@ -1,6 +1,6 @@
 //! Vectors in plain Rust.
 
-use crate::simd::vector::{Simd, Tile};
+use crate::simd::vector::{Operands, Simd, Tile};
 
 /// Arrays of eight values in plain Rust, which the compiler vectorizes with baseline instructions.
 #[derive(Clone, Copy, Debug)]
@@ -80,8 +80,8 @@ impl Simd for Portable {
         a.into_iter().fold(f32::NEG_INFINITY, f32::max)
     }
     #[inline(always)]
-    unsafe fn full_tile(self, tile: Tile) {
+    unsafe fn full_tile<O: Operands>(self, tile: Tile) {
         // SAFETY: by the caller's promise.
-        unsafe { tile.run::<Self, 4, 1>(self) }
+        unsafe { tile.run::<Self, O, 4, 1>(self) }
     }
 }

@@ -4,6 +4,8 @@
 //! safe to call. Functions that are generic over [`Simd`] must be `#[inline(always)]`: only code inlined into
 //! `InstructionSet::run` is compiled with the instructions.
 
+use crate::simd::emulation;
+
 /// Arithmetic on vectors of [`Simd::LANES`] values.
 pub trait Simd: Copy + Send + Sync + 'static {
     const LANES: usize;
@@ -47,7 +49,26 @@ pub trait Simd: Copy + Send + Sync + 'static {
     ///
     /// # Safety
     /// As [`Tile::run`].
-    unsafe fn full_tile(self, tile: Tile);
+    unsafe fn full_tile<O: Operands>(self, tile: Tile);
+
+    /// Rounds both vectors to bf16 and returns pairs: in every lane the value of `first` in the lower half of the bits,
+    /// that of `second` in the upper half.
+    #[inline(always)]
+    fn pairs(self, first: Self::V, second: Self::V) -> Self::V {
+        emulation::pairs(self, first, second)
+    }
+
+    /// Rounds the lanes of `first`, then those of `second`, to bf16 and returns them as pairs of neighbours.
+    #[inline(always)]
+    fn pairs_of_neighbours(self, first: Self::V, second: Self::V) -> Self::V {
+        emulation::pairs_of_neighbours(self, first, second)
+    }
+
+    /// Adds the products of the two values of every pair to `sum`.
+    #[inline(always)]
+    fn dot_pairs(self, a: Self::V, b: Self::V, sum: Self::V) -> Self::V {
+        emulation::dot_pairs(self, a, b, sum)
+    }
 
     /// Reads a vector from the start of a slice; missing values are zero.
     #[inline(always)]
@@ -98,9 +119,71 @@ pub trait Simd: Copy + Send + Sync + 'static {
 /// Most lanes of any instruction set.
 pub(crate) const MAX_LANES: usize = 16;
 
+/// What the lanes of the operands of a matrix product hold.
+pub trait Operands: Copy + Send + Sync + 'static {
+    /// Values per lane, neighbours along the inner dimension.
+    const PER_LANE: usize;
+
+    fn multiply_add<S: Simd>(simd: S, a: S::V, b: S::V, sum: S::V) -> S::V;
+    /// Reads lanes `lane..` of a row along the inner dimension; missing values are zero.
+    fn along<S: Simd>(simd: S, row: &[f32], lane: usize) -> S::V;
+    /// Reads one lane of columns `column..` from the next rows across the inner dimension; missing values are zero.
+    fn across<S: Simd>(simd: S, rows: [&[f32]; 2], column: usize) -> S::V;
+}
+
+/// A value of f32 in every lane.
+#[derive(Clone, Copy, Debug)]
+pub struct F32;
+
+impl Operands for F32 {
+    const PER_LANE: usize = 1;
+
+    #[inline(always)]
+    fn multiply_add<S: Simd>(simd: S, a: S::V, b: S::V, sum: S::V) -> S::V {
+        simd.mul_add(a, b, sum)
+    }
+    #[inline(always)]
+    fn along<S: Simd>(simd: S, row: &[f32], lane: usize) -> S::V {
+        simd.read(from(row, lane))
+    }
+    #[inline(always)]
+    fn across<S: Simd>(simd: S, [row, _]: [&[f32]; 2], column: usize) -> S::V {
+        simd.read(from(row, column))
+    }
+}
+
+/// A pair of bf16 values in every lane, see [`Simd::pairs`].
+#[derive(Clone, Copy, Debug)]
+pub struct Bf16;
+
+impl Operands for Bf16 {
+    const PER_LANE: usize = 2;
+
+    #[inline(always)]
+    fn multiply_add<S: Simd>(simd: S, a: S::V, b: S::V, sum: S::V) -> S::V {
+        simd.dot_pairs(a, b, sum)
+    }
+    #[inline(always)]
+    fn along<S: Simd>(simd: S, row: &[f32], lane: usize) -> S::V {
+        let [first, second] = [2 * lane, 2 * lane + S::LANES].map(|start| from(row, start));
+        simd.pairs_of_neighbours(simd.read(first), simd.read(second))
+    }
+    #[inline(always)]
+    fn across<S: Simd>(simd: S, rows: [&[f32]; 2], column: usize) -> S::V {
+        let [first, second] = rows.map(|row| from(row, column));
+        simd.pairs(simd.read(first), simd.read(second))
+    }
+}
+
+#[inline(always)]
+fn from(values: &[f32], start: usize) -> &[f32] {
+    values.get(start..).unwrap_or_default()
+}
+
 /// A register tile: `C[M, N] = A[M, K] B[K, N]`, or `C += A B` if `accumulate`.
 #[derive(Clone, Copy, Debug)]
 pub struct Tile {
+    /// Lanes along the inner dimension.
     pub inner: usize,
     /// First value of A.
     pub a: *const f32,
@@ -126,7 +209,7 @@ impl Tile {
     /// All values of A, B and C in the range of the sizes must be readable, those of C writable.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "both loops unroll over constants")]
-    pub unsafe fn run<S: Simd, const ROWS: usize, const VECTORS: usize>(self, simd: S) {
+    pub unsafe fn run<S: Simd, O: Operands, const ROWS: usize, const VECTORS: usize>(self, simd: S) {
         let Self { inner, a, a_row, a_step, b, b_step, c, c_row, accumulate } = self;
         // SAFETY: the caller's promise covers every address below.
         unsafe {
@@ -139,7 +222,7 @@ impl Tile {
                 for r in 0..ROWS {
                     let value = simd.splat(*a.add(r * a_row + k * a_step));
                     for v in 0..VECTORS {
-                        sum[r][v] = simd.mul_add(value, row_of_b[v], sum[r][v]);
+                        sum[r][v] = O::multiply_add(simd, value, row_of_b[v], sum[r][v]);
                     }
                 }
             }
@@ -158,12 +241,12 @@ impl Tile {
     /// # Safety
     /// As [`Tile::run`].
     #[inline(always)]
-    pub(crate) unsafe fn run_vectors<S: Simd, const ROWS: usize>(self, simd: S) {
+    pub(crate) unsafe fn run_vectors<S: Simd, O: Operands, const ROWS: usize>(self, simd: S) {
         // SAFETY: by the caller's promise.
         unsafe {
             match S::TILE_VECTORS {
-                1 => self.run::<S, ROWS, 1>(simd),
-                _ => self.run::<S, ROWS, 2>(simd),
+                1 => self.run::<S, O, ROWS, 1>(simd),
+                _ => self.run::<S, O, ROWS, 2>(simd),
             }
         }
     }

@@ -17,7 +17,7 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, 
 use burn::module::Param;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Tensor, assert_shape};
-use clift_kernels::{InstructionSet, linear_forward, sum_rows};
+use clift_kernels::{InstructionSet, Matrix, OperandType, linear_forward, matmul_bf16, sum_rows};
 
 use crate::ops::autodiff::register;
 use crate::ops::flex::{contiguous, is_native, tensor, values};
@@ -156,14 +156,22 @@ fn rows<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
 impl LinearKernels for Flex {
     fn linear_output(precision: Precision, inputs: [FloatTensor<Self>; 3]) -> FloatTensor<Self> {
         let [x, weight, _bias] = &inputs;
-        if !is_native(x) || precision != Precision::F32 {
+        let Some(operands) = precision.native_operands().filter(|_| is_native(x)) else {
             return composed_output::<Self>(precision, inputs);
-        }
+        };
         let [batch, count, width] = x.shape().dims();
         let [_, outputs] = weight.shape().dims();
         let inputs = inputs.map(contiguous);
         let mut output = vec![0.0; batch * count * outputs];
-        linear_forward([batch * count, width, outputs], inputs.each_ref().map(values), &mut output);
+        let sizes = [batch * count, width, outputs];
+        let [x, weight, bias] = inputs.each_ref().map(values);
+        match operands {
+            OperandType::F32 => linear_forward(sizes, [x, weight, bias], &mut output),
+            OperandType::Bf16 => {
+                let factors = [x, weight].map(|values| Matrix { values, transposed: false });
+                matmul_bf16(InstructionSet::detected(), sizes, factors, Some(bias), &mut output);
+            }
+        }
         tensor(output, [batch, count, outputs])
     }
 

@@ -1,8 +1,8 @@
-//! Precision of the operands of matrix products: f32, or f16 on devices with f16.
+//! Precision of the operands of matrix products: f32, bf16 on processors with AVX-512 BF16, or f16 on devices with f16.
 //!
-//! Only the two operands of a product become f16, in linear layers and attention, forward and backward. Weights, results,
+//! Only the two operands of a product are rounded, in linear layers and attention, forward and backward. Weights, results,
 //! sums, norms, softmax, GELU, loss, gradients and optimizer state stay f32, as do the first layers, whose inputs are
-//! rays, and the gates of the condenser.
+//! rays, and the attention inside clusters with its gates.
 //!
 //! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
 //! forward pass. An operation reads the precision once; its backward uses that of its forward.
@@ -17,11 +17,13 @@ use std::marker::PhantomData;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
 use burn::tensor::{DType, Device, FloatDType, Tensor};
+use clift_kernels::{InstructionSet, OperandType, matmul_bf16};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
-use crate::names::parse;
+use crate::names::{names, parse};
+use crate::ops::flex::{matrix, stored_matrix, tensor};
 
 /// Type of the operands of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
@@ -31,6 +33,8 @@ pub enum Precision {
     /// 24 bits of significand.
     #[default]
     F32,
+    /// 8 bits of significand and the range of f32, so that training needs no loss scaling. Native kernels of `flex`.
+    Bf16,
     /// 11 bits of significand, from 6e-8 to 65504: half the bytes, and on most GPUs a multiple of the speed.
     F16,
 }
@@ -40,6 +44,9 @@ thread_local! {
 }
 
 impl Precision {
+    /// All precisions, in the order of help texts.
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+
     /// Returns the current precision of this thread.
     pub fn current() -> Self {
         CURRENT.get()
@@ -59,25 +66,27 @@ impl Precision {
     /// Checks that the device supports the precision, the value of `key`.
     ///
     /// # Errors
-    /// [`ModelError::BadConfig`] for f16 on a device without f16, or whose f16 hides overflows.
+    /// [`ModelError::BadConfig`] for f16 on a device without f16 or whose f16 hides overflows, and for bf16 on a device
+    /// other than `flex` or a processor without AVX-512 BF16.
     pub fn check(self, key: &'static str, device: &Device) -> Result<(), ModelError> {
-        if self == Self::F32 {
-            return Ok(());
-        }
-        let refuse = |reason: &str| {
-            let fix = format!("{reason}; write \"f32\" (`clift doctor` lists the features of devices)");
-            Err(ModelError::BadConfig { key, value: "f16".into(), fix })
-        };
         let device = device.clone().without_autodiff();
-        if !device.supports_dtype(DType::F16) {
-            return refuse("the device has no f16 (on a GPU, the feature SHADER_F16)");
+        let reason = match self {
+            Self::F32 => None,
+            Self::Bf16 => missing_bf16(&device),
+            Self::F16 => missing_f16(&device),
+        };
+        let Some(reason) = reason else { return Ok(()) };
+        let fix = format!("{reason}; write \"f32\" (`clift doctor` lists the features of devices)");
+        Err(ModelError::BadConfig { key, value: self.to_string(), fix })
+    }
+
+    /// Returns the operands of native kernels; `None` for f16, which has none.
+    pub(crate) fn native_operands(self) -> Option<OperandType> {
+        match self {
+            Self::F32 => Some(OperandType::F32),
+            Self::Bf16 => Some(OperandType::Bf16),
+            Self::F16 => None,
         }
-        // Loss scaling detects overflows by infinities; WGSL leaves the result of an overflow to the driver.
-        let large = Tensor::<1>::full([1], 1e6, &device).cast(DType::F16).cast(DType::F32);
-        if large.into_scalar::<f32>().is_finite() {
-            return refuse("the device rounds values above 65504 to finite values, which hides overflows");
-        }
-        Ok(())
     }
 }
 
@@ -85,8 +94,31 @@ impl std::str::FromStr for Precision {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        parse(name).ok_or_else(|| "write f32 or f16".into())
+        parse(name).ok_or_else(|| format!("use one of {}", names::<Self>()))
     }
+}
+
+/// Returns why bf16 cannot be used.
+fn missing_bf16(device: &Device) -> Option<String> {
+    let set = InstructionSet::detected();
+    if *device != Device::flex() {
+        Some("only the device `flex` computes in bf16".into())
+    } else if set.has_bf16() {
+        None
+    } else {
+        Some(format!("the kernels have no bf16 instructions ({}; AVX-512 BF16 is needed)", set.name()))
+    }
+}
+
+/// Returns why f16 cannot be used.
+fn missing_f16(device: &Device) -> Option<String> {
+    if !device.supports_dtype(DType::F16) {
+        return Some("the device has no f16 (on a GPU, the feature SHADER_F16)".into());
+    }
+    // Loss scaling detects overflows by infinities; WGSL leaves the result of an overflow to the driver.
+    let large = Tensor::<1>::full([1], 1e6, device).cast(DType::F16).cast(DType::F32);
+    let hides = large.into_scalar::<f32>().is_finite();
+    hides.then(|| "the device rounds values above 65504 to finite values, which hides overflows".into())
 }
 
 /// Restores the former precision of the thread when dropped.
@@ -106,10 +138,20 @@ impl Drop for PrecisionScope {
 pub trait MatmulKernels: Backend {
     /// Multiplies matrices; f32 operands are rounded to `precision`, operands of another type (f64, in tests) are not.
     fn matmul(precision: Precision, lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
-        if precision == Precision::F32 || lhs.dtype() != DType::F32 {
-            return Self::float_matmul(lhs, rhs);
+        match precision {
+            _ if lhs.dtype() != DType::F32 => Self::float_matmul(lhs, rhs),
+            Precision::F32 => Self::float_matmul(lhs, rhs),
+            Precision::Bf16 => Self::matmul_bf16(lhs, rhs),
+            Precision::F16 => {
+                Self::matmul_f16(Self::float_cast(lhs, FloatDType::F16), Self::float_cast(rhs, FloatDType::F16))
+            }
         }
-        Self::matmul_f16(Self::float_cast(lhs, FloatDType::F16), Self::float_cast(rhs, FloatDType::F16))
+    }
+
+    /// Multiplies f32 matrices whose values it rounds to bf16, and returns f32.
+    fn matmul_bf16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
+        let [lhs, rhs] = [lhs, rhs].map(|x| Self::float_cast(Self::float_cast(x, FloatDType::BF16), FloatDType::F32));
+        Self::float_matmul(lhs, rhs)
     }
 
     /// Multiplies f16 matrices and returns f32; this implementation rounds the product to f16 first, as most backends do.
@@ -118,7 +160,16 @@ pub trait MatmulKernels: Backend {
     }
 }
 
-impl MatmulKernels for Flex {}
+impl MatmulKernels for Flex {
+    fn matmul_bf16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
+        let ([rows, inner], [_, columns]) = (lhs.shape().dims(), rhs.shape().dims());
+        let [lhs, rhs] = [lhs, rhs].map(stored_matrix);
+        let mut output = vec![0.0; rows * columns];
+        let factors = [matrix(&lhs), matrix(&rhs)];
+        matmul_bf16(InstructionSet::detected(), [rows, inner, columns], factors, None, &mut output);
+        tensor(output, [rows, columns])
+    }
+}
 impl MatmulKernels for NdArray {}
 #[cfg(feature = "wgpu")]
 impl MatmulKernels for burn::backend::Cube {
@@ -134,8 +185,12 @@ mod tests {
     use super::*;
     use crate::testing::{devices, random, to_vec};
 
-    fn devices_with_f16() -> impl Iterator<Item = Device> {
-        devices().into_iter().filter(|device| Precision::F16.check("precision", device).is_ok())
+    /// Devices with their precisions below f32.
+    fn reduced_precisions() -> impl Iterator<Item = (Device, Precision)> {
+        let pairs = devices()
+            .into_iter()
+            .flat_map(|device| [Precision::Bf16, Precision::F16].map(|precision| (device.clone(), precision)));
+        pairs.filter(|(device, precision)| precision.check("precision", device).is_ok())
     }
 
     #[test]
@@ -161,6 +216,17 @@ mod tests {
         assert!(message.starts_with("`precision` = f16: the device has no f16"), "{message}");
         assert!(Precision::F32.check("precision", &device).is_ok());
         assert!(Precision::F16.check("precision", &Device::flex()).is_ok());
+    }
+
+    #[test]
+    fn bf16_needs_flex_and_a_processor_with_it() {
+        let device = crate::device::name::DeviceName::Ndarray.open().expect("a CPU device");
+        let message = Precision::Bf16.check("precision", &device).unwrap_err().to_string();
+        assert!(message.starts_with("`precision` = bf16: only the device `flex`"), "{message}");
+        match Precision::Bf16.check("precision", &Device::flex().autodiff()) {
+            Ok(()) => assert!(InstructionSet::detected().has_bf16()),
+            Err(refused) => assert!(refused.to_string().contains("AVX-512 BF16 is needed"), "{refused}"),
+        }
     }
 
     /// Returns output and gradients of a chain of all operations.
@@ -208,9 +274,11 @@ mod tests {
     }
 
     #[test]
-    fn f16_errors_of_outputs_and_gradients_match_11_bits() {
-        let expected = results(&Device::flex(), Precision::F16, DType::F64);
-        assert_eq!(expected, results(&Device::flex(), Precision::F32, DType::F64), "f64 is not rounded");
+    fn errors_of_outputs_and_gradients_match_the_bits_of_the_operands() {
+        let expected = results(&Device::flex(), Precision::F32, DType::F64);
+        for precision in [Precision::Bf16, Precision::F16] {
+            assert_eq!(expected, results(&Device::flex(), precision, DType::F64), "f64 is not rounded");
+        }
         let errors = |found: &[Vec<f64>]| -> Vec<f64> {
             let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
             let error = |(found, expected): (&Vec<f64>, &Vec<f64>)| {
@@ -218,22 +286,23 @@ mod tests {
             };
             found.iter().zip(&expected).map(error).collect()
         };
-        for device in devices_with_f16() {
+        for (device, precision) in reduced_precisions() {
             let f32 = errors(&results(&device, Precision::F32, DType::F32));
-            let f16 = errors(&results(&device, Precision::F16, DType::F32));
-            for (i, (f16, f32)) in f16.iter().zip(&f32).enumerate() {
-                // f16 has 13 bits less than f32; the error of few values varies widely.
-                let ratio = f16 / f32;
-                assert!((200.0..40_000.0).contains(&ratio), "{i}: {f16:.1e} and {f32:.1e}");
-                assert!(*f16 < 3e-2, "{i}: {f16:.1e}");
+            let reduced = errors(&results(&device, precision, DType::F32));
+            // f16 has 13 bits less than f32, bf16 16; the error of few values varies widely.
+            let step = if precision == Precision::F16 { 1.0 } else { 8.0 };
+            for (i, (reduced, f32)) in reduced.iter().zip(&f32).enumerate() {
+                let ratio = reduced / f32 / step;
+                assert!((200.0..40_000.0).contains(&ratio), "{precision}, {i}: {reduced:.1e} and {f32:.1e}");
+                assert!(*reduced < 3e-2 * step, "{precision}, {i}: {reduced:.1e}");
             }
         }
     }
 
     #[test]
     fn large_scores_stay_finite() {
-        for device in devices_with_f16() {
-            let _scope = Precision::F16.scope();
+        for (device, precision) in reduced_precisions() {
+            let _scope = precision.scope();
             // Scores of 50 x 100 x 4.
             let query = Tensor::<3>::full([1, 2, 4], 100.0, &device);
             let keys = query.clone().slice([0..1, 0..1, 0..4]);

@@ -29,8 +29,8 @@ pub struct Config {
     /// backward: the same gradients in less memory, for one more forward pass.
     #[serde(default)]
     pub activation_checkpointing: bool,
-    /// Operands of matrix products in training: `f32`, or `f16` if the device supports f16. Weights, sums, norms, softmax,
-    /// loss and optimizer are f32 in both.
+    /// Operands of matrix products in training: `f32`, `bf16` on the CPU if the processor has AVX-512 BF16, or `f16` if
+    /// the device supports f16. Weights, sums, norms, softmax, loss and optimizer are f32 in all.
     #[serde(default)]
     pub precision: Precision,
     /// Scenes and views.

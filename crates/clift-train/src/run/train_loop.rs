@@ -56,6 +56,7 @@ impl StagePlan<'_> {
         let mut train_state = TrainState {
             loss,
             activation_checkpointing: config.activation_checkpointing,
+            precision: config.precision,
             loss_scale: LossScale::of(config.precision),
             ..TrainState::new(model, optimizer, device.clone())
         };

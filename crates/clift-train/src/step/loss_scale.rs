@@ -22,7 +22,7 @@ pub struct LossScale {
 }
 
 impl LossScale {
-    /// Returns the initial loss scale of a precision; `None` for f32.
+    /// Returns the initial loss scale of a precision; `None` for f32 and bf16, which have the same range.
     pub fn of(precision: Precision) -> Option<Self> {
         (precision == Precision::F16).then_some(Self { factor: FIRST, good_steps: 0 })
     }
@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn factor_grows_slowly_and_shrinks_at_once() {
-        assert_eq!(LossScale::of(Precision::F32), None);
+        assert_eq!([Precision::F32, Precision::Bf16].map(LossScale::of), [None; 2]);
         let mut scale = LossScale::of(Precision::F16).unwrap();
         for _ in 0..PATIENCE - 1 {
             scale.grow();

@@ -29,7 +29,9 @@ pub struct TrainState {
     pub loss: Loss,
     /// Whether the backward recomputes every block instead of storing its activations.
     pub activation_checkpointing: bool,
-    /// Loss scale of training with f16 products; `None` for f32.
+    /// Operands of matrix products.
+    pub precision: Precision,
+    /// Loss scale of training with f16 products; `None` for others.
     pub loss_scale: Option<LossScale>,
 }
 
@@ -50,7 +52,15 @@ impl TrainState {
     /// Makes the state before the first update: mean squared error, f32, activations stored.
     pub fn new(model: Clift, optimizer: &OptimizerConfig, device: Device) -> Self {
         let (optimizer, loss) = (make_optimizer(optimizer), Loss::default());
-        Self { model, optimizer, device, loss, activation_checkpointing: false, loss_scale: None }
+        Self {
+            model,
+            optimizer,
+            device,
+            loss,
+            activation_checkpointing: false,
+            precision: Precision::F32,
+            loss_scale: None,
+        }
     }
 
     /// Makes one update from a batch in `accumulate` micro-batches. An update with a loss or gradient that is not finite is
@@ -86,8 +96,7 @@ impl TrainState {
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
     ) -> Result<(Self, Update), TrainError> {
-        let Self { model, mut optimizer, device, loss, activation_checkpointing, loss_scale } = self;
-        let precision = if loss_scale.is_some() { Precision::F16 } else { Precision::F32 };
+        let Self { model, mut optimizer, device, loss, activation_checkpointing, precision, loss_scale } = self;
         let _scope = precision.scope();
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
         let mut accumulator = GradientsAccumulator::<Clift>::new();
@@ -130,7 +139,7 @@ impl TrainState {
         } else {
             model
         };
-        Ok((Self { model, optimizer, device, loss, activation_checkpointing, loss_scale }, update))
+        Ok((Self { model, optimizer, device, loss, activation_checkpointing, precision, loss_scale }, update))
     }
 
     /// Adapts the loss scale after an update. Returns whether the update overflowed.

@@ -97,13 +97,12 @@ impl ViewServer {
     /// [`ViewError::Model`] if the device cannot be opened, [`ViewError::Serve`] if the thread of the connections fails.
     pub fn run(self, scenes: SceneSet, device_name: DeviceName) -> Result<(), ViewError> {
         let device = device_name.open()?;
-        let precisions = [Precision::F32, Precision::F16].into_iter();
         let hello = Hello {
             scenes: scenes.keys(),
             device: device_name.to_string(),
             selections: SelectionPreset::ALL.map(SelectionPreset::name).to_vec(),
             default_selection: SelectionPreset::default().name(),
-            precisions: precisions
+            precisions: (Precision::ALL.into_iter())
                 .filter(|one| one.check("precision", &device).is_ok())
                 .map(Precision::as_str)
                 .collect(),

@@ -7,7 +7,12 @@ fn rows(values: &[f32], sizes: &AttentionSizes, count: usize) -> StridedRows<'st
     StridedRows { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
 }
 
-fn gradients(set: InstructionSet, sizes: AttentionSizes, saved: BackwardInputs<'_>) -> [Vec<f32>; 3] {
+fn gradients(
+    set: InstructionSet,
+    operands: OperandType,
+    sizes: AttentionSizes,
+    saved: BackwardInputs<'_>,
+) -> [Vec<f32>; 3] {
     let AttentionSizes { batch, num_queries, num_keys, .. } = sizes;
     let dim = sizes.dim();
     let part = |packed: &[f32], parts: usize, part: usize| {
@@ -16,11 +21,11 @@ fn gradients(set: InstructionSet, sizes: AttentionSizes, saved: BackwardInputs<'
     let mut query = vec![f32::NAN; batch * num_queries * dim];
     let mut key_value = vec![f32::NAN; batch * num_keys * 2 * dim];
     let to = AttentionGradients::Separate { query: &mut query, key_value: &mut key_value };
-    attention_backward(set, sizes, saved, to);
+    attention_backward(set, operands, sizes, saved, to);
     let separate = [query, part(&key_value, 2, 0), part(&key_value, 2, 1)];
     if num_queries == num_keys {
         let mut packed = vec![f32::NAN; batch * num_queries * 3 * dim];
-        attention_backward(set, sizes, saved, AttentionGradients::Packed(&mut packed));
+        attention_backward(set, operands, sizes, saved, AttentionGradients::Packed(&mut packed));
         assert_eq!([0, 1, 2].map(|i| part(&packed, 3, i)), separate);
     }
     separate
@@ -35,13 +40,16 @@ fn check(sizes: AttentionSizes, spread: f32) {
     }
     let (k, v, grad) = (make(num_keys, 2), make(num_keys, 3), make(num_queries, 4));
     let expected = attention_reference(&sizes, [&q, &k, &v, &grad]);
-    for set in InstructionSet::available() {
+    // bf16 has 8 bits of significand; errors of scores grow with the scores.
+    let bf16 = (OperandType::Bf16, 1e-2 * f64::from(spread));
+    let all = InstructionSet::available().flat_map(|set| [(OperandType::F32, 1e-5), bf16].map(|with| (set, with)));
+    for (set, (operands, tolerance)) in all {
         let mut output = vec![f32::NAN; q.len()];
         let mut log_sum = vec![f32::NAN; batch * num_heads * num_queries];
         let [query, key, value] =
             [rows(&q, &sizes, num_queries), rows(&k, &sizes, num_keys), rows(&v, &sizes, num_keys)];
-        attention_forward(set, sizes, [query, key, value], &mut output, Some(&mut log_sum));
-        assert_close(&output, &expected[0], 1e-5);
+        attention_forward(set, operands, sizes, [query, key, value], &mut output, Some(&mut log_sum));
+        assert_close(&output, &expected[0], tolerance);
         let saved = BackwardInputs {
             query,
             key,
@@ -50,13 +58,13 @@ fn check(sizes: AttentionSizes, spread: f32) {
             log_sum: &log_sum,
             grad_output: rows(&grad, &sizes, num_queries),
         };
-        let grads = gradients(set, sizes, saved);
+        let grads = gradients(set, operands, sizes, saved);
         for (grad, expected) in grads.iter().zip(&expected[1..]) {
             // One key: the exact gradient of queries and keys is zero.
             if num_keys > 1 || expected.iter().any(|&value| value != 0.0) {
-                assert_close(grad, expected, 1e-5);
+                assert_close(grad, expected, tolerance);
             } else {
-                assert!(grad.iter().all(|value| value.abs() < 1e-5));
+                assert!(grad.iter().all(|value| f64::from(value.abs()) < tolerance));
             }
         }
     }

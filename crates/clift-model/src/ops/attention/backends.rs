@@ -1,4 +1,4 @@
-//! The implementation of every backend: on flex and in f32 the native kernels, which read packed projections and write
+//! The implementation of every backend: on flex, in f32 and bf16, the native kernels, which read packed projections and write
 //! packed gradients; elsewhere attention in chunks of queries.
 #![expect(
     deprecated,
@@ -15,21 +15,22 @@ use clift_kernels::{
 
 use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, composed_forward};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
-use crate::ops::precision::{MatmulKernels, Precision};
+use crate::ops::precision::MatmulKernels;
 
 impl AttentionKernels for Flex {
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
-        if !inputs.is_native() || heads.precision != Precision::F32 {
+        let HeadConfig { num_heads, precision } = heads;
+        let Some(operands) = precision.native_operands().filter(|_| inputs.is_native()) else {
             return composed_forward::<Self>(inputs, heads);
-        }
-        let HeadConfig { num_heads, .. } = heads;
+        };
         let inputs = inputs.clone().contiguous();
         let sizes = inputs.sizes(num_heads);
         let AttentionSizes { batch, num_queries, head_width, .. } = sizes;
         let dim = num_heads * head_width;
         let mut output = vec![0.0; batch * num_queries * dim];
         let mut log_sum = vec![0.0; batch * num_heads * num_queries];
-        attention_forward(InstructionSet::detected(), sizes, inputs.rows(dim), &mut output, Some(&mut log_sum));
+        let set = InstructionSet::detected();
+        attention_forward(set, operands, sizes, inputs.rows(dim), &mut output, Some(&mut log_sum));
         let log_sum = tensor(log_sum, [batch, num_heads, num_queries]);
         AttentionOutput { output: tensor(output, [batch, num_queries, dim]), log_sum: Some(log_sum) }
     }
@@ -40,10 +41,10 @@ impl AttentionKernels for Flex {
         heads: HeadConfig,
         grad_output: FloatTensor<Self>,
     ) -> Qkv<FloatTensor<Self>> {
-        let Some(log_sum) = attended.log_sum else {
+        let HeadConfig { num_heads, precision } = heads;
+        let (Some(log_sum), Some(operands)) = (attended.log_sum, precision.native_operands()) else {
             return composed_backward::<Self>(&inputs, attended.output, heads, grad_output);
         };
-        let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.contiguous();
         let sizes = inputs.sizes(num_heads);
         let AttentionSizes { batch, num_queries, num_keys, head_width, .. } = sizes;
@@ -56,14 +57,14 @@ impl AttentionKernels for Flex {
         match inputs {
             Qkv::Packed(_) => {
                 let mut grad = vec![0.0; batch * num_queries * 3 * dim];
-                attention_backward(set, sizes, saved, AttentionGradients::Packed(&mut grad));
+                attention_backward(set, operands, sizes, saved, AttentionGradients::Packed(&mut grad));
                 Qkv::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
             }
             Qkv::Separate { .. } => {
                 let mut query = vec![0.0; batch * num_queries * dim];
                 let mut key_value = vec![0.0; batch * num_keys * 2 * dim];
                 let to = AttentionGradients::Separate { query: &mut query, key_value: &mut key_value };
-                attention_backward(set, sizes, saved, to);
+                attention_backward(set, operands, sizes, saved, to);
                 let query = tensor(query, [batch, num_queries, dim]);
                 Qkv::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
             }

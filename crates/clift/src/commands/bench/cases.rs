@@ -42,8 +42,9 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
 
 fn report_text(report: &BenchReport) -> String {
     let header = ["case", "median", "p95", "peak memory", "error against f64"];
-    let f16 = if report.precision == Precision::F16 { ", f16 products" } else { "" };
-    let title = format!("{}, {} threads{f16}\n", report.device, report.threads);
+    let reduced = Some(report.precision).filter(|precision| *precision != Precision::F32);
+    let products = reduced.map_or_else(String::new, |precision| format!(", {precision} products"));
+    let title = format!("{}, {} threads{products}\n", report.device, report.threads);
     let table = table(header, report.rows.iter().map(cells));
     [title, table].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
 }

@@ -27,7 +27,9 @@ pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
 }
 
 fn report_text(report: &PrecisionReport) -> String {
-    let header = ["case", "f32", "f16", "f16/f32", "error", "loss f32, f16", "PSNR"];
+    let reduced = report.precision;
+    let (ratio, losses) = (format!("{reduced}/f32"), format!("loss f32, {reduced}"));
+    let header = ["case", "f32", reduced.as_str(), &ratio, "error", &losses, "PSNR"];
     let remark = "error: norm of the difference from f32 over the norm of f32, for updates of the whole gradient; \
                   PSNR: of updates against their targets, of render against the f32 image";
     format!("{}\n\n{}\n\n{remark}", report.device, table(header, report.rows.iter().map(cells)))
@@ -35,20 +37,28 @@ fn report_text(report: &PrecisionReport) -> String {
 
 fn cells(row: &PrecisionRow) -> [String; 7] {
     let dash = || "-".to_owned();
-    let loss = row.loss.map_or_else(dash, |[f32, f16]| format!("{f32:.6}, {f16:.6}"));
+    let loss = row.loss.map_or_else(dash, |[f32, reduced]| format!("{f32:.6}, {reduced:.6}"));
     let psnr = match (row.psnr(), row.psnr_to_f32) {
-        (Some([f32, f16]), _) => format!("{f32:.3}, {f16:.3} dB"),
+        (Some([f32, reduced]), _) => format!("{f32:.3}, {reduced:.3} dB"),
         (None, Some(psnr)) => format!("{psnr:.1} dB"),
         (None, None) => dash(),
     };
-    let [f32_time, f16_time] = [row.f32_s, row.f16_s].map(seconds);
-    [row.case.to_string(), f32_time, f16_time, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
+    let [f32_time, reduced_time] = [row.f32_s, row.reduced_s].map(seconds);
+    [
+        row.case.to_string(),
+        f32_time,
+        reduced_time,
+        format!("{:.2}", row.ratio),
+        format!("{:.1e}", row.error),
+        loss,
+        psnr,
+    ]
 }
 
 #[cfg(test)]
 mod tests {
     use clift_bench::BenchCase;
-    use clift_model::DeviceName;
+    use clift_model::{DeviceName, Precision};
 
     use super::*;
 
@@ -57,7 +67,7 @@ mod tests {
         let row = |case, loss, psnr_to_f32| PrecisionRow {
             case,
             f32_s: 0.5,
-            f16_s: 0.25,
+            reduced_s: 0.25,
             ratio: 0.5,
             error: 1.2e-3,
             loss,
@@ -76,7 +86,7 @@ encode       500 ms  250 ms  0.50     1.2e-3  -                   -
 render       500 ms  250 ms  0.50     1.2e-3  -                   61.2 dB
 stage1_step  500 ms  250 ms  0.50     1.2e-3  0.100000, 0.100000  10.000, 10.000 dB
 ";
-        let text = report_text(&PrecisionReport { device: DeviceName::Flex, rows });
+        let text = report_text(&PrecisionReport { device: DeviceName::Flex, precision: Precision::F16, rows });
         assert!(text.starts_with(expected), "{text}");
     }
 }

@@ -15,6 +15,8 @@ const TOLERANCE: f64 = 1e-3;
 
 /// Largest accepted difference with f16 operands: their rounding of 5e-4 accumulates over four blocks.
 const TOLERANCE_F16: f64 = 3e-2;
+/// Largest accepted difference with bf16 operands, whose rounding is 8 times that of f16.
+const TOLERANCE_BF16: f64 = 2e-1;
 
 /// Prints the machine and a row per device, or runs the stability cases; fails with the default device or a case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
@@ -30,20 +32,28 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let default = DeviceName::default();
     let reference = probe(default, Precision::F32).and_then(|probe| check(probe, None, TOLERANCE));
     let expected = reference.as_ref().ok();
-    let (mut rows, mut f16_rows) = (Vec::new(), Vec::new());
+    let (mut rows, mut reduced_rows) = (Vec::new(), Vec::new());
     for name in DeviceName::ALL {
         let probed = if name == default {
             reference.clone()
         } else {
             probe(name, Precision::F32).and_then(|probe| check(probe, expected, TOLERANCE))
         };
-        if probed.as_ref().is_ok_and(|probe| probe.dtypes.contains(&"f16")) {
-            let f16 = probe(name, Precision::F16).and_then(|probe| check(probe, expected, TOLERANCE_F16));
-            f16_rows.push(row(name, Precision::F16, f16.as_ref(), expected));
+        for (precision, tolerance) in [(Precision::Bf16, TOLERANCE_BF16), (Precision::F16, TOLERANCE_F16)] {
+            let has_bf16 = || name.open().is_ok_and(|device| Precision::Bf16.check("precision", &device).is_ok());
+            let offers = |probe: &DeviceCheck| match precision {
+                Precision::Bf16 => has_bf16(),
+                // What offers f16 and cannot be used gets a row with the reason.
+                _ => probe.dtypes.contains(&"f16"),
+            };
+            if probed.as_ref().is_ok_and(offers) {
+                let reduced = probe(name, precision).and_then(|probe| check(probe, expected, tolerance));
+                reduced_rows.push(row(name, precision, reduced.as_ref(), expected));
+            }
         }
         rows.push(row(name, Precision::F32, probed.as_ref(), expected));
     }
-    rows.extend(f16_rows);
+    rows.extend(reduced_rows);
     print_result(&device_table(rows))?;
     for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
         print_result(&format!("\n{name} is not part of this build: cargo build --release --features {name}"))?;
@@ -99,13 +109,12 @@ fn row(
     probed: Result<&DeviceCheck, &String>,
     reference: Option<&DeviceCheck>,
 ) -> [String; 6] {
-    let is_f16 = precision == Precision::F16;
-    let is_default = name == DeviceName::default() && !is_f16;
+    let is_default = name == DeviceName::default() && precision == Precision::F32;
     let dash = || "-".to_owned();
-    let device = match (is_f16, is_default) {
-        (true, _) => format!("{name}, f16"),
-        (false, true) => format!("{name} (default)"),
-        (false, false) => name.to_string(),
+    let device = match precision {
+        Precision::F32 if is_default => format!("{name} (default)"),
+        Precision::F32 => name.to_string(),
+        Precision::Bf16 | Precision::F16 => format!("{name}, {precision}"),
     };
     match probed {
         Err(_) if !name.is_built() => [device, "not built".into(), dash(), dash(), dash(), dash()],

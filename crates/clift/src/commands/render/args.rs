@@ -53,8 +53,8 @@ pub struct RenderArgs {
     /// Device: flex, ndarray or wgpu [default: flex]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceName>,
-    /// Operands of matrix products: f32, or f16 if the device supports it
-    #[arg(long, value_name = "f32|f16", default_value_t)]
+    /// Operands of matrix products: f32, or bf16 or f16 if the device supports it
+    #[arg(long, value_name = "PRECISION", default_value_t)]
     pub precision: Precision,
 }
 

@@ -1,0 +1,79 @@
+//! Operands of matrix products, laid out for the register tile.
+
+use crate::simd::vector::{MAX_LANES, Operands, Simd};
+
+/// Returns the lanes that `count` values along the inner dimension take.
+pub(crate) fn lanes_of<O: Operands>(count: usize) -> usize {
+    count.div_ceil(O::PER_LANE)
+}
+
+/// Packs rows along the inner dimension, one after the other: `to[row][lane]` with `width` lanes a row, zeros at the end.
+#[inline(always)]
+pub(crate) fn pack_rows<'a, S: Simd, O: Operands>(
+    simd: S,
+    rows: impl Iterator<Item = &'a [f32]>,
+    width: usize,
+    to: &mut [f32],
+) {
+    for (row, to) in rows.zip(to.chunks_exact_mut(width)) {
+        for (i, to) in to.chunks_mut(S::LANES).enumerate() {
+            simd.write(to, O::along(simd, row, i * S::LANES));
+        }
+    }
+}
+
+/// Packs a row along the inner dimension in its own place, the lanes at the start.
+#[inline(always)]
+pub(crate) fn pack_in_place<S: Simd, O: Operands>(simd: S, row: &mut [f32]) {
+    if O::PER_LANE > 1 {
+        for start in (0..lanes_of::<O>(row.len())).step_by(S::LANES) {
+            // Written where the values are read already.
+            let packed = O::along(simd, row, start);
+            simd.write(&mut row[start..], packed);
+        }
+    }
+}
+
+/// Packs rows across the inner dimension: `to[lane][column]` with `width` columns, zeros at the end.
+#[inline(always)]
+pub(crate) fn pack_across<'a, S: Simd, O: Operands>(
+    simd: S,
+    mut rows: impl Iterator<Item = &'a [f32]>,
+    width: usize,
+    to: &mut [f32],
+) {
+    for to in to.chunks_exact_mut(width) {
+        let Some(first) = rows.next() else { break };
+        let second = if O::PER_LANE == 2 { rows.next().unwrap_or_default() } else { &[] };
+        for (i, to) in to.chunks_mut(S::LANES).enumerate() {
+            simd.write(to, O::across(simd, [first, second], i * S::LANES));
+        }
+    }
+}
+
+/// Packs rows along the inner dimension as columns of panels: `to[panel][lane][column]` with `lanes` lanes and `width`
+/// columns a panel, zeros at the end of the last one.
+#[inline(always)]
+pub(crate) fn pack_transposed<'a, S: Simd, O: Operands>(
+    simd: S,
+    mut rows: impl ExactSizeIterator<Item = &'a [f32]>,
+    [lanes, width]: [usize; 2],
+    to: &mut [f32],
+) {
+    for to in to.chunks_exact_mut(lanes * width) {
+        let columns = width.min(rows.len());
+        if columns < width {
+            to.fill(0.0);
+        }
+        for column in 0..columns {
+            let row = rows.next().expect("the iterator reports its length");
+            for (start, to) in (0..lanes).step_by(S::LANES).zip(to.chunks_mut(S::LANES * width)) {
+                let mut packed = [0.0; MAX_LANES];
+                simd.write(&mut packed, O::along(simd, row, start));
+                for (to, value) in to[column..].iter_mut().step_by(width).zip(packed) {
+                    *to = value;
+                }
+            }
+        }
+    }
+}
