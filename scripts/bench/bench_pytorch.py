@@ -1,4 +1,4 @@
-"""Compares clift with PyTorch: the same work, alternately, on a quiet Linux machine's CPU in f32.
+"""Compares clift with PyTorch: the same work, alternately, on a quiet Linux machine's CPU, in f32 and in bf16.
 
     python3 scripts/bench/bench_pytorch.py --size smoke                          # does it run? seconds, no judgement
     python3 scripts/bench/bench_pytorch.py --targets --json bench.json           # the full sizes
@@ -10,7 +10,8 @@ clift, unless `--python` and `--clift` name what there is.
 A round starts one process of each side, in turn the other way round, with the same number of threads; a process does
 one piece of work only, and its peak memory is read from the kernel at its end. PyTorch is the twin (clift_torch.py) on
 fused attention, with the faster ways of torch_cases.py; where it has several, all are timed first and the fastest
-competes. Ours is `clift bench`. A round in which somebody else used the processor is thrown away and made again.
+competes, in bf16 under autocast. Ours is `clift bench`, in bf16 with `precision = "bf16"`. A round in which somebody
+else used the processor is thrown away and made again.
 
 Exit codes: 0 done, 1 something failed (or a target was missed, with --strict), 2 wrong usage, 3 the machine is not
 quiet, 130 interrupted.
@@ -89,6 +90,9 @@ class Measured:
     inertia: list[float]
     foreign_cores: float
     wall_s: float
+    # Floating-point operations of a repetition, and the most a second that the processor makes in registers; ours only.
+    flops: float | None = None
+    peak_flops: float | None = None
 
 
 class Bench:
@@ -123,7 +127,7 @@ class Bench:
         return [str(self.python), str(HERE / "torch_cases.py"), json.dumps({"threads": self.args.threads, **spec})]
 
     def torch_spec(self, side: Torch, round_: int | None, variant: str | None) -> dict[str, Any]:
-        spec = dict(work=side.work, variant=variant, size=SIZES[side.size or self.args.size])
+        spec = dict(work=side.work, variant=variant, size=SIZES[side.size or self.args.size], precision=side.precision)
         repeats = PROBES if round_ is None else self.args.repeats
         spec |= dict(repeats=repeats, warmup=self.args.warmup)
         if side.work == "kmeans":
@@ -144,6 +148,7 @@ class Bench:
     def measure(self, side: Side, round_: int | None, variant: str | None = None) -> Measured:
         command = self.command(side, round_, variant)
         finished = quiet_machine.run(command, self.env)
+        written: dict[str, Any] = {}
         if isinstance(side, Torch):
             found = json.loads(finished.stdout)
         else:
@@ -155,7 +160,8 @@ class Bench:
                 raise CommandFailed(f"clift used {written['threads']} threads instead of {self.args.threads}")
         inertia = found.get("inertia") or []
         inertia = inertia if isinstance(inertia, list) else [inertia]
-        return Measured(found["samples_s"], finished.peak_bytes, inertia, finished.foreign_cores, finished.wall_s)
+        speed = (found.get("flops"), written.get("peak_flops"))
+        return Measured(found["samples_s"], finished.peak_bytes, inertia, finished.foreign_cores, finished.wall_s, *speed)
 
     def wait(self) -> None:
         if not self.args.force:
@@ -168,7 +174,7 @@ class Bench:
         times = {}
         for variant in variants:
             # Rows that differ in the variants they allow do the same thing in those they share.
-            key = (side.work.removesuffix("_unshared"), side.size, variant)
+            key = (side.work.removesuffix("_unshared"), side.size, f"{side.precision} {variant}")
             if key not in self.probed:
                 self.wait()
                 self.probed[key] = min(self.measure(side, None, variant).samples)
@@ -231,7 +237,7 @@ def run_group(bench: Bench, group: list[Row], variants: dict[str, list[str]]) ->
 
 
 def describe(side: Side) -> str:
-    name = "PyTorch" if isinstance(side, Torch) else " ".join(["clift", *side.overrides])
+    name = f"PyTorch {side.precision}" if isinstance(side, Torch) else " ".join(["clift", *side.overrides])
     return f"{name} {side.work}"
 
 
@@ -248,6 +254,11 @@ def summarise(row: Row, rounds: list[dict[Side, Measured]], baseline_bytes: int)
         inertia = [value for one in measured for value in one.inertia]
         if inertia:
             result[f"{name}_inertia"] = statistics.fmean(inertia)
+    peaks = [one.peak_flops for found in rounds if (one := found.get(row.ours)) and one.flops and one.peak_flops]
+    if peaks and result["ours_s"]:
+        flops = next(one.flops for found in rounds if (one := found.get(row.ours)))
+        result["gflops"] = flops / result["ours_s"] / 1e9
+        result["share_of_peak"] = flops / result["ours_s"] / max(peaks)
     result["foreign_cores"] = max(one.foreign_cores for found in rounds for one in found.values())
     if result["ours_s"] and result["pytorch_s"]:
         ratios = [
@@ -288,7 +299,8 @@ def gigabytes(value: int | None) -> str:
 
 
 def table(results: list[dict[str, Any]], targets: bool) -> str:
-    head = ["work", "ours", "PyTorch", "ratio (rounds)", "ours", "PyTorch", "ratio"] + ["target"] * targets
+    head = ["work", "ours", "GFLOP/s (of peak)", "PyTorch", "ratio (rounds)", "ours", "PyTorch", "ratio"]
+    head += ["target"] * targets
     lines = [head, ["---"] * len(head)]
     for result in results:
         if "error" in result:
@@ -299,7 +311,8 @@ def table(results: list[dict[str, Any]], targets: bool) -> str:
             low, high = result["ratio_spread"]
             ratio = f"{result['ratio']:.3f} ({low:.3f} .. {high:.3f})"
         memory = f"{result['memory_ratio']:.2f}" if "memory_ratio" in result else "-"
-        line = [result["work"], seconds(result["ours_s"]), seconds(result["pytorch_s"]), ratio]
+        speed = f"{result['gflops']:.0f} ({result['share_of_peak']:.0%})" if "gflops" in result else "-"
+        line = [result["work"], seconds(result["ours_s"]), speed, seconds(result["pytorch_s"]), ratio]
         line += [gigabytes(result["ours_bytes"]), gigabytes(result["pytorch_bytes"]), memory]
         if targets:
             names = {"ratio": "time", "memory_ratio": "memory", "ours_bytes": "bytes", "inertia_ratio": "inertia"}

@@ -31,6 +31,7 @@ class Torch:
 
     work: str
     size: str | None = None
+    precision: str = "f32"  # or "bf16": under autocast
 
 
 Side = Ours | Torch
@@ -51,6 +52,10 @@ class Row:
 def rows() -> list[Row]:
     def same(work: str, *targets: tuple[str, float]) -> Row:
         return Row(work, work, Ours(work), Torch(work), targets)
+
+    def in_bf16(work: str, *targets: tuple[str, float]) -> Row:
+        ours = Ours(work, ('precision="bf16"',))
+        return Row(f"{work}_bf16", f"{work}_bf16", ours, Torch(work, precision="bf16"), targets)
 
     stage1, views, stage2 = Torch("stage1_step"), Ours("render_8_views"), Ours("stage2_step")
     checkpointed = Ours("stage1_step", ("activation_checkpointing=true",))
@@ -76,6 +81,10 @@ def rows() -> list[Row]:
         same("kmeans", ("ratio", 0.2), ("inertia_ratio", 1.01)),
         Row("lvsm_step", "lvsm_step", Ours("stage1_step", is_lvsm=True), Torch("lvsm_step"), (("ratio", 0.9),)),
         Row("lvsm_render", "lvsm_render", Ours("render", is_lvsm=True), Torch("lvsm_render"), (("ratio", 0.9),)),
+        in_bf16("stage1_step", ("ratio", 0.7), ("memory_ratio", 0.6)),
+        in_bf16("stage2_step", ("ratio", 0.7)),
+        in_bf16("encode", ("ratio", 0.7)),
+        in_bf16("render", ("ratio", 0.7)),
         Row("growth", "growth", Ours("stage1_step", contexts=16), None, (("ours_bytes", 12e9),)),
     ]
 

@@ -31,6 +31,8 @@ import lvsm_torch as lvsm
 NUM_VIEWS_OF_SCENE = 8
 # The C++ encoder layer and attention that torch.nn takes in inference when it may. It is not always the faster way.
 FAST_PATH = {"sdpa": False, "fastpath": True}
+# Variants with `torch.compile` of encoder, condenser and renderer.
+COMPILED = "compiled "
 
 Work = Callable[[], Any]
 Size = dict[str, int]
@@ -212,6 +214,7 @@ def adamw(groups: list[dict[str, Any]]) -> torch.optim.AdamW:
 
 def stage1_step(size: Size, variant: str) -> Work:
     model = twin.Clift(model_config(size))
+    compile_if(variant, model.encoder, model.renderer)
     optimizer = adamw([dict(params=list(model.parameters()), lr=1e-4)])
     batch = training_batch(size)
     return lambda: twin.stage1_step(model, optimizer, batch)[0].item()
@@ -232,11 +235,12 @@ def lvsm_step(size: Size, variant: str) -> Work:
 
 def stage2_step(size: Size, variant: str) -> Work:
     """Frozen encoder, condenser at the full rate, renderer at a tenth of it, clusters given."""
-    padded, path = variant.startswith("padded"), variant.rsplit(" ", 1)[-1]
+    padded, path = "padded" in variant, variant.rsplit(" ", 1)[-1]
     torch.backends.mha.set_fastpath_enabled(FAST_PATH[path])
     model = twin.Clift(model_config(size))
     model.condenser = make_condenser(size)
     model.encoder.requires_grad_(False).eval()
+    compile_if(variant, model.encoder, model.condenser, model.renderer)
     trained = [*model.condenser.parameters(), *model.renderer.parameters()]
     optimizer = adamw(
         [dict(params=model.condenser.parameters(), lr=1e-4), dict(params=model.renderer.parameters(), lr=1e-5)]
@@ -272,9 +276,10 @@ def stage2_step(size: Size, variant: str) -> Work:
 
 
 def encode(size: Size, variant: str) -> Work:
-    torch.backends.mha.set_fastpath_enabled(FAST_PATH[variant])
+    torch.backends.mha.set_fastpath_enabled(FAST_PATH[variant.removeprefix(COMPILED)])
     c, side = model_config(size), size["side"]
     encoder = twin.Encoder(c.dim, c.num_heads, c.num_encoder_blocks, c.feed_forward_dim).eval()
+    compile_if(variant, encoder)
     images, (intrinsics, c2w) = pictures(1, size["contexts"], side), cameras(1, size["contexts"], side)
     return inference(lambda: encoder(images, twin.plucker(intrinsics, c2w, side, side)))
 
@@ -285,8 +290,9 @@ def make_renderer(size: Size) -> twin.Renderer:
 
 
 def render(size: Size, variant: str) -> Work:
-    torch.backends.mha.set_fastpath_enabled(FAST_PATH[variant])
+    torch.backends.mha.set_fastpath_enabled(FAST_PATH[variant.removeprefix(COMPILED)])
     renderer, side = make_renderer(size), size["side"]
+    compile_if(variant, renderer)
     count = size.get("render_tokens", num_tokens(size))
     memory, (intrinsics, c2w) = torch.randn(1, count, size["dim"]), cameras(1, 1, side)
     return inference(lambda: renderer(memory, twin.plucker(intrinsics, c2w, side, side)))
@@ -361,16 +367,17 @@ def inference(work: Work) -> Work:
 
 
 PATHS = list(FAST_PATH)
+WAYS = [*PATHS, COMPILED + "sdpa"]
 UNSHARED = [f"{way} {path}" for way in ("batch", "one by one") for path in PATHS]
 MASKS = [f"{keys}, {mask} mask" for keys in ("all", "members") for mask in ("bool", "float")]
 WORKS: dict[str, tuple[Callable[[Size, str], Work], list[str]]] = {
-    "stage1_step": (stage1_step, ["sdpa"]),
+    "stage1_step": (stage1_step, ["sdpa", COMPILED + "sdpa"]),
     "lvsm_step": (lvsm_step, ["sdpa"]),
     "lvsm_render": (lvsm_render, ["sdpa"]),
-    "stage2_step": (stage2_step, [f"exact {path}" for path in PATHS]),
+    "stage2_step": (stage2_step, [f"exact {path}" for path in PATHS] + [COMPILED + "exact sdpa"]),
     "stage2_step_padded": (stage2_step, [f"padded {path}" for path in PATHS]),
-    "encode": (encode, PATHS),
-    "render": (render, PATHS),
+    "encode": (encode, WAYS),
+    "render": (render, WAYS),
     "render_8_views": (render_8_views, UNSHARED + [f"shared memory {path}" for path in PATHS]),
     "render_8_views_unshared": (render_8_views, UNSHARED),
     "condense": (condense, PATHS),
@@ -425,6 +432,19 @@ def measure(work: Work, repeats: int, warmup: int, finish: Callable[[], None] = 
     return samples
 
 
+def autocast(kind: str, precision: str) -> contextlib.AbstractContextManager[Any]:
+    """bf16 autocast where the precision is `bf16`. Rays stay f32, as ours do."""
+    twin.plucker = torch.autocast(kind, enabled=False)(twin.plucker)
+    return torch.autocast(kind, dtype=torch.bfloat16, enabled=precision == "bf16")
+
+
+def compile_if(variant: str, *modules: nn.Module) -> None:
+    """Compiles the modules for variants that begin so."""
+    if variant.startswith(COMPILED):
+        for module in modules:
+            module.compile()
+
+
 def on_device(spec: dict[str, Any]) -> dict[str, Any]:
     """A work on a device: `cuda`, `mps` or `cpu`, in `f32`, `tf32` (f32 with TF32 products) or `bf16` (autocast).
 
@@ -436,10 +456,8 @@ def on_device(spec: dict[str, Any]) -> dict[str, Any]:
     is_cuda = device.startswith("cuda")
     finish = torch.cuda.synchronize if is_cuda else torch.mps.synchronize if device == "mps" else lambda: None
     kind = device.split(":")[0]
-    # Rays stay f32, as ours do.
-    twin.plucker = torch.autocast(kind, enabled=False)(twin.plucker)
     make, _ = WORKS[spec["work"]]
-    with torch.autocast(kind, dtype=torch.bfloat16, enabled=precision == "bf16"):
+    with autocast(kind, precision):
         work = make(spec["size"], spec["variant"])
         samples = measure(work, spec["repeats"], spec["warmup"], finish)
     peak = torch.cuda.max_memory_allocated() if is_cuda else None
@@ -470,7 +488,8 @@ def main() -> None:
         result = kmeans(spec["features"], spec["repeats"], spec["seed"])
     else:
         make, _ = WORKS[spec["work"]]
-        samples = measure(make(spec["size"], spec["variant"]), spec["repeats"], spec["warmup"])
+        with autocast("cpu", spec["precision"]):
+            samples = measure(make(spec["size"], spec["variant"]), spec["repeats"], spec["warmup"])
         per_view = NUM_VIEWS_OF_SCENE if spec["work"].startswith("render_8_views") else 1
         result = {"samples_s": [sample / per_view for sample in samples]}
     print(json.dumps(result))

@@ -16,6 +16,7 @@ use crate::cases::case::BenchCase;
 use crate::cases::clustering::KMeansCase;
 use crate::cases::coding::CodingCase;
 use crate::cases::context::{BenchContext, BenchOptions};
+use crate::cases::flops::flops;
 use crate::cases::forward;
 use crate::cases::selection::SelectionCase;
 use crate::cases::step::StepCase;
@@ -30,6 +31,9 @@ pub struct BenchReport {
     pub precision: Precision,
     /// Threads of the CPU devices.
     pub threads: usize,
+    /// Operations per second of products that stay in registers, with the operands of `precision`, measured between the
+    /// cases; `None` on other devices than `flex`.
+    pub peak_flops: Option<f64>,
     /// One row per case.
     pub rows: Vec<BenchRow>,
 }
@@ -51,6 +55,9 @@ pub struct BenchRow {
     /// [`MAX_CHECKED_TOKENS`](crate::MAX_CHECKED_TOKENS) tokens. For K-means: the relative difference of the inertia, since
     /// the f64 clustering may differ.
     pub max_rel_error: Option<f64>,
+    /// Floating-point operations of layers and attention in a repetition: two per multiply-accumulate, a backward counts
+    /// as two forwards; `None` for cases of other work.
+    pub flops: Option<f64>,
     /// Seconds of every timed repetition; per view for `render_8_views`.
     pub samples_s: Vec<f64>,
     /// Sum of squared distances to the cluster means, for K-means.
@@ -89,6 +96,8 @@ pub fn run_bench(
     let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(is_measured).collect();
     let total = cases.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;
+    let peak = || if config.device == DeviceName::Flex { config.precision.peak_flops() } else { None };
+    let mut peak_flops = peak();
     let mut rows = Vec::with_capacity(cases.len());
     for case in cases {
         let mut advance = |count| {
@@ -103,8 +112,10 @@ pub fn run_bench(
         let row = measure(case, &context, options, &mut advance)?;
         report(BenchEvent::Finished(&row));
         rows.push(row);
+        peak_flops = peak_flops.zip(peak()).map(|(former, now)| former.max(now));
     }
-    Ok(BenchReport { device: config.device, precision: config.precision, threads: rayon::current_num_threads(), rows })
+    let (device, precision, threads) = (config.device, config.precision, rayon::current_num_threads());
+    Ok(BenchReport { device, precision, threads, peak_flops, rows })
 }
 
 /// Makes networks and inputs of a case, so that only its computation is left to be timed.
@@ -160,7 +171,8 @@ fn measure(
         None
     };
     let (median_s, p95_s) = (median(&samples_s), p95(&samples_s));
-    Ok(BenchRow { case, median_s, p95_s, peak_bytes, max_rel_error, samples_s, inertia })
+    let flops = flops(case, context)?;
+    Ok(BenchRow { case, median_s, p95_s, peak_bytes, max_rel_error, flops, samples_s, inertia })
 }
 
 #[cfg(test)]

@@ -35,6 +35,8 @@ mod testing;
 
 // Choice of the instruction set
 pub use simd::dispatch::{InstructionSet, InstructionSetError, OperandType};
+// The bound of every product
+pub use simd::peak::peak_flops;
 // Softmax attention
 pub use attention::backward::{BackwardInputs, attention_backward};
 pub use attention::forward::attention_forward;

@@ -4,6 +4,7 @@
 //! - `reference`: the same computation in f64
 //! - `task`: traits of a timed computation
 //! - `context`: options, device and sizes of all rows
+//! - `flops`: floating-point operations of a row
 //! - `forward`: rows without gradient
 //! - `step`: rows of whole updates
 //! - `clustering`: the K-means row
@@ -14,6 +15,7 @@ pub(crate) mod case;
 pub(crate) mod clustering;
 pub(crate) mod coding;
 pub(crate) mod context;
+pub(crate) mod flops;
 pub(crate) mod forward;
 pub(crate) mod reference;
 pub(crate) mod selection;

@@ -17,7 +17,7 @@ use std::marker::PhantomData;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
 use burn::tensor::{DType, Device, FloatDType, Tensor};
-use clift_kernels::{InstructionSet, OperandType, matmul_bf16};
+use clift_kernels::{InstructionSet, OperandType, matmul_bf16, peak_flops};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -78,6 +78,12 @@ impl Precision {
         let Some(reason) = reason else { return Ok(()) };
         let fix = format!("{reason}; write \"f32\" (`clift doctor` lists the features of devices)");
         Err(ModelError::BadConfig { key, value: self.to_string(), fix })
+    }
+
+    /// Measures the floating-point operations per second of all threads in products that stay in registers; `None` for f16,
+    /// which has no native kernels.
+    pub fn peak_flops(self) -> Option<f64> {
+        self.native_operands().map(|operands| peak_flops(InstructionSet::detected(), operands))
     }
 
     /// Returns the operands of native kernels; `None` for f16, which has none.

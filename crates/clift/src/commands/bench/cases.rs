@@ -41,11 +41,12 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
 }
 
 fn report_text(report: &BenchReport) -> String {
-    let header = ["case", "median", "p95", "peak memory", "error against f64"];
+    let header = ["case", "median", "p95", "GFLOP/s", "peak memory", "error against f64"];
     let reduced = Some(report.precision).filter(|precision| *precision != Precision::F32);
     let products = reduced.map_or_else(String::new, |precision| format!(", {precision} products"));
-    let title = format!("{}, {} threads{products}\n", report.device, report.threads);
-    let table = table(header, report.rows.iter().map(cells));
+    let peak = report.peak_flops.map_or_else(String::new, |peak| format!(", {:.0} GFLOP/s in registers", peak / 1e9));
+    let title = format!("{}, {} threads{products}{peak}\n", report.device, report.threads);
+    let table = table(header, report.rows.iter().map(|row| cells(row, report.peak_flops)));
     [title, table].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
 }
 
@@ -68,15 +69,18 @@ fn remarks(rows: &[BenchRow]) -> Vec<String> {
     remarks
 }
 
-fn cells(row: &BenchRow) -> [String; 5] {
+fn cells(row: &BenchRow, peak: Option<f64>) -> [String; 6] {
     let mark = if row.case.is_checked_reduced() { " *" } else { "" };
     let error = match row.max_rel_error {
         None => "-".into(),
         Some(error) if error.is_finite() => format!("{error:.1e}{mark}"),
         Some(_) => format!("not finite{mark}"),
     };
-    let peak = row.peak_bytes.map_or_else(|| "unknown".into(), memory_size);
-    [row.case.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
+    let memory = row.peak_bytes.map_or_else(|| "unknown".into(), memory_size);
+    let speed = row.flops.map(|flops| flops / row.median_s);
+    let share = speed.zip(peak).map_or_else(String::new, |(speed, peak)| format!(" ({:.0} %)", 1e2 * speed / peak));
+    let speed = speed.map_or_else(|| "-".into(), |speed| format!("{:.0}{share}", speed / 1e9));
+    [row.case.to_string(), seconds(row.median_s), seconds(row.p95_s), speed, memory, error]
 }
 
 /// Measurements other than the cases of a config.
@@ -125,6 +129,7 @@ mod tests {
             p95_s: median_s * 2.0,
             peak_bytes,
             max_rel_error,
+            flops: (case == BenchCase::Encode).then_some(1e12),
             samples_s: vec![median_s],
             inertia,
         }
@@ -139,21 +144,22 @@ mod tests {
             row(BenchCase::Stage1Step, 123.4, None, Some(2e-5)),
         ];
         let expected = "\
-flex, 2 threads
+flex, 2 threads, 300 GFLOP/s in registers
 
-case            median   p95      peak memory  error against f64
-encode          12.3 s   24.7 s   3.00 GiB     3.1e-7
-kmeans          500 ms   1.00 s   700 MiB      not finite
-render_8_views  12.3 ms  24.6 ms  unknown      -
-stage1_step     123 s    247 s    unknown      2.0e-5 *
+case            median   p95      GFLOP/s    peak memory  error against f64
+encode          12.3 s   24.7 s   81 (27 %)  3.00 GiB     3.1e-7
+kmeans          500 ms   1.00 s   -          700 MiB      not finite
+render_8_views  12.3 ms  24.6 ms  -          unknown      -
+stage1_step     123 s    247 s    -          unknown      2.0e-5 *
 
 render_8_views: seconds per view
 kmeans: inertia 1.234500e3; the error is that of the inertia
 * error of loss and gradients, with at most 1024 tokens
 - not compared with f64";
-        let mut report = BenchReport { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows };
+        let (device, precision, peak_flops) = (DeviceName::Flex, Precision::F32, Some(3e11));
+        let mut report = BenchReport { device, precision, threads: 2, peak_flops, rows };
         assert_eq!(report_text(&report), expected);
         report.rows.truncate(1);
-        assert!(report_text(&report).ends_with("\nencode  12.3 s  24.7 s  3.00 GiB     3.1e-7"));
+        assert!(report_text(&report).ends_with("\nencode  12.3 s  24.7 s  81 (27 %)  3.00 GiB     3.1e-7"));
     }
 }
