@@ -233,14 +233,36 @@ pub fn weight_gradients<M: burn::module::Module>(
     prefix: &str,
     tolerance: f64,
 ) {
+    for (path, [got, expected]) in gradient_pairs(module, grads, fixture, prefix) {
+        let error = relative_error(&got, &expected);
+        assert!(error <= tolerance, "{path}: relative error {error:.3e} above {tolerance:.1e}");
+    }
+}
+
+/// Returns the norm of the difference and the norm of the second of every pair.
+pub fn error_norms(pairs: &[[Tensor<1>; 2]]) -> [f64; 2] {
+    let norm = |values: &mut dyn Iterator<Item = Vec<f64>>| values.flatten().map(|x| x * x).sum::<f64>().sqrt();
+    let difference = |[got, expected]: &[Tensor<1>; 2]| {
+        to_vec(got.clone()).into_iter().zip(to_vec(expected.clone())).map(|(a, b)| a - b).collect()
+    };
+    [norm(&mut pairs.iter().map(difference)), norm(&mut pairs.iter().map(|[_, expected]| to_vec(expected.clone())))]
+}
+
+/// Returns the gradient of every parameter of a module beside the fixture's, flat, with the parameter's path.
+#[track_caller]
+pub fn gradient_pairs<M: burn::module::Module>(
+    module: &M,
+    grads: &burn::tensor::Gradients,
+    fixture: &Fixture,
+    prefix: &str,
+) -> Vec<(String, [Tensor<1>; 2])> {
     use burn::module::{ModuleVisitor, Param};
     struct Compare<'a> {
         grads: &'a burn::tensor::Gradients,
         fixture: &'a Fixture,
         prefix: &'a str,
         path: Vec<String>,
-        tolerance: f64,
-        compared: usize,
+        pairs: Vec<(String, [Tensor<1>; 2])>,
     }
     impl ModuleVisitor for Compare<'_> {
         fn enter_module(&mut self, name: &str, _container: &str) {
@@ -258,12 +280,11 @@ pub fn weight_gradients<M: burn::module::Module>(
             let expected: Tensor<D> = self.fixture.tensor(&name, &got.device());
             // PyTorch stores linear weights as [outputs, inputs].
             let expected = if D == 2 { expected.swap_dims(0, 1) } else { expected };
-            let error = relative_error(&got, &expected);
-            assert!(error <= self.tolerance, "{path}: relative error {error:.3e} above {:.1e}", self.tolerance);
-            self.compared += 1;
+            self.pairs.push((path, [got, expected].map(|x| x.reshape([-1]))));
         }
     }
-    let mut compare = Compare { grads, fixture, prefix, path: Vec::new(), tolerance, compared: 0 };
+    let mut compare = Compare { grads, fixture, prefix, path: Vec::new(), pairs: Vec::new() };
     module.visit(&mut compare);
-    assert_eq!(compare.compared, fixture.names(prefix).len(), "every gradient of the fixture is compared");
+    assert_eq!(compare.pairs.len(), fixture.names(prefix).len(), "every gradient of the fixture is compared");
+    compare.pairs
 }

@@ -88,50 +88,121 @@ impl SceneModel for Clift {
 mod tests {
     use super::*;
     use crate::network::architecture::CliftVariant;
-    use crate::testing::{Fixture, assert_close, devices, load_weights, small_lvsm, weight_gradients};
+    use crate::ops::precision::Precision;
+    use crate::testing::{
+        Fixture, assert_close, devices, error_norms, gradient_pairs, load_weights, small_lvsm, weight_gradients,
+    };
 
-    #[test]
-    fn encoder_and_renderer_equal_pytorch_with_gradients() {
-        let small = |config| ModelConfig {
+    fn small(config: ModelConfig) -> ModelConfig {
+        ModelConfig {
             dim: 16,
             num_heads: 4,
             feed_forward_dim: 24,
             num_encoder_blocks: 2,
             num_renderer_blocks: 2,
             ..config
-        };
+        }
+    }
+
+    #[test]
+    fn encoder_and_renderer_equal_pytorch_with_gradients() {
         assert_equals_pytorch("model", &small(ModelConfig::default()));
         assert_equals_pytorch("lvsm", &small(small_lvsm(CliftVariant::Paper)));
         assert_equals_pytorch("lvsm_stock", &small(small_lvsm(CliftVariant::ReleasedRe10k)));
+    }
+
+    /// What a fixture has results of, and the weights.
+    struct Trained {
+        encoder: Encoder,
+        renderer: Renderer,
+        lift: Tensor<3>,
+        rendering: Tensor<5>,
+        loss: Tensor<1>,
+    }
+
+    fn forward(fixture: &Fixture, config: &ModelConfig, device: &Device) -> Trained {
+        let Clift { encoder, renderer, .. } = Clift::new(config, 0, device);
+        let encoder = load_weights(encoder, fixture, "weight.encoder.");
+        let renderer = load_weights(renderer, fixture, "weight.renderer.");
+        let cameras = |kind: &str| Cameras {
+            height: 16,
+            width: 24,
+            c2w: fixture.tensor(&format!("input.{kind}_c2w"), device),
+            intrinsics: fixture.tensor(&format!("input.{kind}_intrinsics"), device),
+        };
+        let context = Views { images: fixture.tensor("input.context_images", device), cameras: cameras("context") };
+        let tokens = encoder.forward(&context);
+        let lift = tokens.values.clone();
+        let rendering = renderer.forward(tokens, &cameras("target"));
+        let loss = (rendering.clone() - fixture.tensor("input.target_images", device)).square().mean();
+        Trained { encoder, renderer, lift, rendering, loss }
     }
 
     fn assert_equals_pytorch(name: &str, config: &ModelConfig) {
         let fixture = Fixture::open(name);
         for device in devices() {
             let device = device.autodiff();
-            let Clift { encoder, renderer, .. } = Clift::new(config, 0, &device);
-            let encoder = load_weights(encoder, &fixture, "weight.encoder.");
-            let renderer = load_weights(renderer, &fixture, "weight.renderer.");
-            let cameras = |kind: &str| Cameras {
-                height: 16,
-                width: 24,
-                c2w: fixture.tensor(&format!("input.{kind}_c2w"), &device),
-                intrinsics: fixture.tensor(&format!("input.{kind}_intrinsics"), &device),
-            };
-            let context =
-                Views { images: fixture.tensor("input.context_images", &device), cameras: cameras("context") };
-            let lift = encoder.forward(&context);
-            assert_close(&lift.values.clone().inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
-            let rendering = renderer.forward(lift, &cameras("target"));
-            let expected = fixture.tensor::<5>("output.rendering", &device);
-            assert_close(&rendering.clone().inner(), &expected.inner(), 1e-5);
-            let target: Tensor<5> = fixture.tensor("input.target_images", &device);
-            let loss = (rendering - target).square().mean();
+            let Trained { encoder, renderer, lift, rendering, loss } = forward(&fixture, config, &device);
+            assert_close(&lift.inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
+            assert_close(&rendering.inner(), &fixture.tensor::<5>("output.rendering", &device).inner(), 1e-5);
             let expected = fixture.tensor::<1>("output.loss", &device);
             assert_close(&loss.clone().inner(), &expected.inner(), 1e-6);
             let grads = loss.backward();
             weight_gradients(&encoder, &grads, &fixture, "grad.weight.encoder.", 5e-5);
             weight_gradients(&renderer, &grads, &fixture, "grad.weight.renderer.", 5e-5);
         }
+    }
+
+    /// Errors against f64, norm over norm; those of PyTorch are from `scripts/fixtures/make_autocast_errors.py`.
+    #[test]
+    fn bf16_is_at_least_as_close_to_f64_as_pytorch_autocast() {
+        let device = Device::flex().autodiff();
+        if Precision::Bf16.check("precision", &device).is_err() {
+            return;
+        }
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/autocast.json");
+        let text = std::fs::read_to_string(path).expect("a checked-in file");
+        let pytorch: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+        let pytorch = |name: &str| pytorch["errors"][name].as_f64().unwrap_or_else(|| panic!("{name} is in {path}"));
+        let fixture = Fixture::open("model");
+        let _scope = Precision::Bf16.scope();
+        let Trained { encoder, renderer, lift, rendering, loss } =
+            forward(&fixture, &small(ModelConfig::default()), &device);
+        let flat = |x: Tensor<3>| x.reshape([-1]);
+        let outputs = [
+            ("output.lift", flat(lift), flat(fixture.tensor("output.lift", &device))),
+            (
+                "output.rendering",
+                rendering.reshape([-1]),
+                fixture.tensor::<5>("output.rendering", &device).reshape([-1]),
+            ),
+        ];
+        let mut ratios = Vec::new();
+        for (name, got, expected) in outputs {
+            let [difference, norm] = error_norms(&[[got.inner(), expected.inner()]]);
+            assert!(
+                difference / norm <= pytorch(name),
+                "{name}: {:.2e}, PyTorch {:.2e}",
+                difference / norm,
+                pytorch(name)
+            );
+        }
+        let grads = loss.backward();
+        let mut pairs = gradient_pairs(&encoder, &grads, &fixture, "grad.weight.encoder.");
+        let mut of_renderer = gradient_pairs(&renderer, &grads, &fixture, "grad.weight.renderer.");
+        for (prefix, pairs) in [("encoder", &pairs), ("renderer", &of_renderer)] {
+            for (name, pair) in pairs {
+                let [difference, norm] = error_norms(std::slice::from_ref(pair));
+                ratios.push(difference / norm / pytorch(&format!("grad.weight.{prefix}.{name}")));
+            }
+        }
+        pairs.append(&mut of_renderer);
+        let [difference, norm] = error_norms(&pairs.into_iter().map(|(_, pair)| pair).collect::<Vec<_>>());
+        let error = difference / norm;
+        assert!(error <= pytorch("grad"), "whole gradient: {error:.2e}, PyTorch {:.2e}", pytorch("grad"));
+        // Single gradients differ by chance; half of them are closer than PyTorch's.
+        ratios.sort_by(f64::total_cmp);
+        assert!(ratios[ratios.len() / 2] <= 1.0, "median {:.2} of PyTorch's error", ratios[ratios.len() / 2]);
+        println!("whole gradient {error:.2e}, PyTorch {:.2e}; ratios {ratios:.2?}", pytorch("grad"));
     }
 }
