@@ -8,7 +8,11 @@ use crate::support::{repository, sources};
 type Crate = (&'static str, &'static str, &'static str);
 
 const CRATES: [Crate; 8] = [
-    ("clift-kernels", "", "simd primitives attention cluster_attention gelu head_transform layer_norm linear"),
+    (
+        "clift-kernels",
+        "",
+        "simd primitives attention cluster_attention gelu head_transform layer_norm linear matmul_bf16",
+    ),
     ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights codec scene"),
     (
         "clift-data",

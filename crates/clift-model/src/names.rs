@@ -60,7 +60,7 @@ mod tests {
     fn every_variant_is_printed_and_parsed_by_its_name() {
         check::<FlopConvention>("paper, macs, flops");
         check::<DeviceName>("flex, ndarray, wgpu");
-        check::<Precision>("f32, f16");
+        check::<Precision>("f32, bf16, f16");
         check::<SelectionPreset>("paper, global, scaled");
         check::<TokenFormat>("f32, f16, int8");
         check::<CliftVariant>("paper, released-re10k, released-dl3dv");

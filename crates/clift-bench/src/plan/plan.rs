@@ -408,7 +408,7 @@ mod tests {
             let plan = plan(&config, &PlanOptions { is_timed: true, ..UNTIMED }).expect("runs without weight files");
             for part in plan.parts {
                 let seconds = part.seconds.expect("timed");
-                assert!(seconds > 0.0 && seconds < 60.0, "{device} {}: {seconds}", part.part);
+                assert!(seconds > 0.0 && seconds.is_finite(), "{device} {}: {seconds}", part.part);
             }
         }
     }

@@ -1,8 +1,9 @@
 //! AVX-512 vectors, with and without bf16.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx512` proves that the processor has AVX-512")]
 
-use crate::simd::emulation;
-use crate::simd::vector::{Operands, Simd, Tile, binary_intrinsics};
+use crate::simd::vector::{
+    Operands, Simd, Tile, binary_intrinsics, emulated_dot_pairs, emulated_pairs, emulated_pairs_of_neighbours,
+};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
@@ -85,7 +86,7 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
     #[inline(always)]
     fn pairs(self, first: __m512, second: __m512) -> __m512 {
         if !BF16 {
-            return emulation::pairs(self, first, second);
+            return emulated_pairs(self, first, second);
         }
         unsafe {
             let both = _mm512_cvtne2ps_pbh(second, first);
@@ -97,14 +98,14 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
     #[inline(always)]
     fn pairs_of_neighbours(self, first: __m512, second: __m512) -> __m512 {
         if !BF16 {
-            return emulation::pairs_of_neighbours(self, first, second);
+            return emulated_pairs_of_neighbours(self, first, second);
         }
         unsafe { std::mem::transmute::<__m512bh, __m512>(_mm512_cvtne2ps_pbh(second, first)) }
     }
     #[inline(always)]
     fn dot_pairs(self, a: __m512, b: __m512, sum: __m512) -> __m512 {
         if !BF16 {
-            return emulation::dot_pairs(self, a, b, sum);
+            return emulated_dot_pairs(self, a, b, sum);
         }
         unsafe {
             let a = std::mem::transmute::<__m512, __m512bh>(a);

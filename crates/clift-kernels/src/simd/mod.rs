@@ -4,7 +4,6 @@
 //! - `portable`: vectors in plain Rust
 //! - `avx2`: AVX2 and FMA
 //! - `avx512`: AVX-512, with and without bf16
-//! - `emulation`: bf16 without instructions for it
 //! - `peak`: the most that the processor computes
 //! - `dispatch`: the choice of the instruction set, and running a kernel with it
 
@@ -13,7 +12,6 @@ pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
 pub(crate) mod dispatch;
-pub(crate) mod emulation;
 pub(crate) mod peak;
 pub(crate) mod portable;
 pub(crate) mod vector;

@@ -4,7 +4,7 @@
 //! safe to call. Functions that are generic over [`Simd`] must be `#[inline(always)]`: only code inlined into
 //! `InstructionSet::run` is compiled with the instructions.
 
-use crate::simd::emulation;
+use half::bf16;
 
 /// Arithmetic on vectors of [`Simd::LANES`] values.
 pub trait Simd: Copy + Send + Sync + 'static {
@@ -55,19 +55,19 @@ pub trait Simd: Copy + Send + Sync + 'static {
     /// that of `second` in the upper half.
     #[inline(always)]
     fn pairs(self, first: Self::V, second: Self::V) -> Self::V {
-        emulation::pairs(self, first, second)
+        emulated_pairs(self, first, second)
     }
 
     /// Rounds the lanes of `first`, then those of `second`, to bf16 and returns them as pairs of neighbours.
     #[inline(always)]
     fn pairs_of_neighbours(self, first: Self::V, second: Self::V) -> Self::V {
-        emulation::pairs_of_neighbours(self, first, second)
+        emulated_pairs_of_neighbours(self, first, second)
     }
 
     /// Adds the products of the two values of every pair to `sum`.
     #[inline(always)]
     fn dot_pairs(self, a: Self::V, b: Self::V, sum: Self::V) -> Self::V {
-        emulation::dot_pairs(self, a, b, sum)
+        emulated_dot_pairs(self, a, b, sum)
     }
 
     /// Reads a vector from the start of a slice; missing values are zero.
@@ -118,6 +118,50 @@ pub trait Simd: Copy + Send + Sync + 'static {
 
 /// Most lanes of any instruction set.
 pub(crate) const MAX_LANES: usize = 16;
+
+/// [`Simd::pairs`] without instructions for bf16: slow, a reference for tests.
+#[inline(always)]
+pub(crate) fn emulated_pairs<S: Simd>(simd: S, first: S::V, second: S::V) -> S::V {
+    let (first, second) = (array(simd, first), array(simd, second));
+    simd.read(&std::array::from_fn::<_, MAX_LANES, _>(|lane| pair(first[lane], second[lane])))
+}
+
+/// [`Simd::pairs_of_neighbours`] without instructions for bf16.
+#[inline(always)]
+pub(crate) fn emulated_pairs_of_neighbours<S: Simd>(simd: S, first: S::V, second: S::V) -> S::V {
+    let mut values = [0.0; 2 * MAX_LANES];
+    values[..S::LANES].copy_from_slice(&array(simd, first)[..S::LANES]);
+    values[S::LANES..2 * S::LANES].copy_from_slice(&array(simd, second)[..S::LANES]);
+    simd.read(&std::array::from_fn::<_, MAX_LANES, _>(|lane| pair(values[2 * lane], values[2 * lane + 1])))
+}
+
+/// [`Simd::dot_pairs`] without instructions for bf16.
+#[inline(always)]
+pub(crate) fn emulated_dot_pairs<S: Simd>(simd: S, a: S::V, b: S::V, sum: S::V) -> S::V {
+    let (a, b, sum) = (array(simd, a), array(simd, b), array(simd, sum));
+    simd.read(&std::array::from_fn::<_, MAX_LANES, _>(|lane| {
+        let ([a_first, a_second], [b_first, b_second]) = (values(a[lane]), values(b[lane]));
+        sum[lane] + a_first * b_first + a_second * b_second
+    }))
+}
+
+/// Rounds two values to bf16, ties to even, and packs their bits.
+fn pair(first: f32, second: f32) -> f32 {
+    let bits = |value| u32::from(bf16::from_f32(value).to_bits());
+    f32::from_bits(bits(first) | bits(second) << 16)
+}
+
+fn values(pair: f32) -> [f32; 2] {
+    [f32::from_bits(pair.to_bits() << 16), f32::from_bits(pair.to_bits() & 0xFFFF_0000)]
+}
+
+#[inline(always)]
+fn array<S: Simd>(simd: S, vector: S::V) -> [f32; MAX_LANES] {
+    let mut array = [0.0; MAX_LANES];
+    // SAFETY: no vector is longer than the array.
+    unsafe { simd.store(array.as_mut_ptr(), vector) };
+    array
+}
 
 /// What the lanes of the operands of a matrix product hold.
 pub trait Operands: Copy + Send + Sync + 'static {

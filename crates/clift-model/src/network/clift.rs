@@ -112,7 +112,7 @@ mod tests {
     }
 
     /// What a fixture has results of, and the weights.
-    struct Trained {
+    struct ForwardPass {
         encoder: Encoder,
         renderer: Renderer,
         lift: Tensor<3>,
@@ -120,7 +120,7 @@ mod tests {
         loss: Tensor<1>,
     }
 
-    fn forward(fixture: &Fixture, config: &ModelConfig, device: &Device) -> Trained {
+    fn forward(fixture: &Fixture, config: &ModelConfig, device: &Device) -> ForwardPass {
         let Clift { encoder, renderer, .. } = Clift::new(config, 0, device);
         let encoder = load_weights(encoder, fixture, "weight.encoder.");
         let renderer = load_weights(renderer, fixture, "weight.renderer.");
@@ -135,14 +135,14 @@ mod tests {
         let lift = tokens.values.clone();
         let rendering = renderer.forward(tokens, &cameras("target"));
         let loss = (rendering.clone() - fixture.tensor("input.target_images", device)).square().mean();
-        Trained { encoder, renderer, lift, rendering, loss }
+        ForwardPass { encoder, renderer, lift, rendering, loss }
     }
 
     fn assert_equals_pytorch(name: &str, config: &ModelConfig) {
         let fixture = Fixture::open(name);
         for device in devices() {
             let device = device.autodiff();
-            let Trained { encoder, renderer, lift, rendering, loss } = forward(&fixture, config, &device);
+            let ForwardPass { encoder, renderer, lift, rendering, loss } = forward(&fixture, config, &device);
             assert_close(&lift.inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
             assert_close(&rendering.inner(), &fixture.tensor::<5>("output.rendering", &device).inner(), 1e-5);
             let expected = fixture.tensor::<1>("output.loss", &device);
@@ -166,7 +166,7 @@ mod tests {
         let pytorch = |name: &str| pytorch["errors"][name].as_f64().unwrap_or_else(|| panic!("{name} is in {path}"));
         let fixture = Fixture::open("model");
         let _scope = Precision::Bf16.scope();
-        let Trained { encoder, renderer, lift, rendering, loss } =
+        let ForwardPass { encoder, renderer, lift, rendering, loss } =
             forward(&fixture, &small(ModelConfig::default()), &device);
         let flat = |x: Tensor<3>| x.reshape([-1]);
         let outputs = [

@@ -121,7 +121,8 @@ mod tests {
             let new_state = |loss_scale| {
                 let model = freeze(crate::events::Stage::Stage1, seeded_model(&sizes, 3, &device));
                 let plain = TrainState::new(model, &OptimizerConfig::default(), device.clone().autodiff());
-                TrainState { activation_checkpointing, loss_scale, ..plain }
+                let precision = if loss_scale.is_some() { Precision::F16 } else { Precision::F32 };
+                TrainState { activation_checkpointing, precision, loss_scale, ..plain }
             };
             let (_, expected) = new_state(None).step(&batch, 1, 1e-4.into(), 1.0).unwrap();
             let hash = |state: &TrainState| clift_model::weights_hash(&state.model);
