@@ -118,7 +118,7 @@ mod tests {
         };
         let batch = seeded_batch(ClipShape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
         for activation_checkpointing in [false, true] {
-            let new_state = |loss_scale| {
+            let new_state = |loss_scale: Option<LossScale>| {
                 let model = freeze(crate::events::Stage::Stage1, seeded_model(&sizes, 3, &device));
                 let plain = TrainState::new(model, &OptimizerConfig::default(), device.clone().autodiff());
                 let precision = if loss_scale.is_some() { Precision::F16 } else { Precision::F32 };
