@@ -6,16 +6,12 @@
 //!
 //! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
 //! forward pass. An operation reads the precision once; its backward uses that of its forward.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 
 use std::cell::Cell;
 use std::marker::PhantomData;
 
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
+use burn::backend::{Backend, Flex, TensorMetadata};
 use burn::tensor::{DType, Device, FloatDType, Tensor};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
@@ -119,7 +115,8 @@ pub trait MatmulKernels: Backend {
 }
 
 impl MatmulKernels for Flex {}
-impl MatmulKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl MatmulKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl MatmulKernels for burn::backend::Cube {
     /// The kernels accumulate in f32 and write f32.
