@@ -37,7 +37,7 @@ pub fn view_cameras(views: &ClipViews) -> Vec<ViewCamera> {
 }
 
 fn pixel_values(scenes: &[&ClipViews]) -> Vec<u8> {
-    scenes.iter().flat_map(|views| &views.images).copied().collect()
+    scenes.iter().map(|views| &views.images[..]).collect::<Vec<_>>().concat()
 }
 
 fn camera_values(scenes: &[&ClipViews]) -> (Vec<f32>, Vec<f32>) {

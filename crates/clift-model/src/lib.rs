@@ -26,6 +26,13 @@
 //! assert_eq!(image.dims(), [1, 1, 16, 16, 3]);
 //! # Ok::<(), clift_model::ModelError>(())
 //! ```
+#![cfg_attr(
+    feature = "ndarray",
+    expect(
+        deprecated,
+        reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+    )
+)]
 
 mod codec;
 mod cost;

@@ -16,7 +16,7 @@ pub enum DeviceName {
     /// Burn's CPU backend, the default.
     #[default]
     Flex,
-    /// Burn's older CPU backend, an independent reference for numerical tests.
+    /// Burn's older CPU backend, an independent reference for numerical tests; needs the cargo feature `ndarray`.
     Ndarray,
     /// Any GPU through WebGPU (Vulkan, Metal, DX12); needs the cargo feature `wgpu`.
     Wgpu,
@@ -34,7 +34,8 @@ impl DeviceName {
     /// Whether this build contains the device.
     pub fn is_built(self) -> bool {
         match self {
-            Self::Flex | Self::Ndarray => true,
+            Self::Flex => true,
+            Self::Ndarray => cfg!(feature = "ndarray"),
             Self::Wgpu => cfg!(feature = "wgpu"),
         }
     }
@@ -55,10 +56,14 @@ impl DeviceName {
                 InstructionSet::forced().map_err(bad)?;
                 Ok(Device::flex())
             }
-            // Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference.
-            #[allow(deprecated)]
+            #[cfg(feature = "ndarray")]
             Self::Ndarray => Ok(Device::ndarray()),
+            #[cfg(not(feature = "ndarray"))]
+            Self::Ndarray => Err(self.not_built("second CPU backend")),
+            #[cfg(feature = "wgpu")]
             Self::Wgpu => open_wgpu(),
+            #[cfg(not(feature = "wgpu"))]
+            Self::Wgpu => Err(self.not_built("GPU support")),
         }
     }
 
@@ -72,6 +77,15 @@ impl DeviceName {
             Self::Flex | Self::Ndarray => Ok((self.open()?, None)),
             Self::Wgpu => open_nth_wgpu(index),
         }
+    }
+
+    #[cfg(not(all(feature = "ndarray", feature = "wgpu")))]
+    fn not_built(self, what: &str) -> ModelError {
+        let reason = format!(
+            "this build has no {what}; rebuild with `cargo build --release --features {self}`, \
+             or choose `flex` (`--device flex`)"
+        );
+        ModelError::NoDevice { name: self.to_string(), reason }
     }
 }
 
@@ -87,18 +101,8 @@ impl std::str::FromStr for DeviceName {
 }
 
 #[cfg(not(feature = "wgpu"))]
-fn open_wgpu() -> Result<Device, ModelError> {
-    Err(ModelError::NoDevice {
-        name: "wgpu".into(),
-        reason: "this build has no GPU support; rebuild with `cargo build --release --features wgpu`, \
-                 or choose `flex` (`--device flex`)"
-            .into(),
-    })
-}
-
-#[cfg(not(feature = "wgpu"))]
 fn open_nth_wgpu(_index: usize) -> Result<(Device, Option<String>), ModelError> {
-    Ok((open_wgpu()?, None))
+    Ok((DeviceName::Wgpu.open()?, None))
 }
 
 #[cfg(feature = "wgpu")]
@@ -148,13 +152,18 @@ fn open_wgpu() -> Result<Device, ModelError> {
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
 }
 
-#[cfg(all(test, not(feature = "wgpu")))]
+#[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_build_without_wgpu_names_the_feature() {
-        let message = DeviceName::Wgpu.open().unwrap_err().to_string();
-        assert!(message.contains("--features wgpu"), "{message}");
+    fn a_device_that_is_not_built_names_its_feature() {
+        for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
+            let message = name.open().unwrap_err().to_string();
+            assert!(
+                message.contains(&format!("`cargo build --release --features {name}`, or choose `flex`")),
+                "{message}"
+            );
+        }
     }
 }

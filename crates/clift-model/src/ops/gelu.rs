@@ -1,11 +1,7 @@
 //! GELU with exact gradient on every backend.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
+use burn::backend::{Backend, Flex, TensorMetadata};
 use clift_kernels::{InstructionSet, gelu_backward, gelu_forward};
 
 use crate::ops::flex::{contiguous, is_native, tensor, values, values_mut};
@@ -59,6 +55,7 @@ impl GeluKernels for Flex {
     }
 }
 
-impl GeluKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl GeluKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl GeluKernels for burn::backend::Cube {}

@@ -1,8 +1,4 @@
 //! The transform of heads in camera-relative attention, by the camera and the patch of every token.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 // B scenes, N tokens, P parts of a row, H heads, E width of a head
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -10,7 +6,7 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 use clift_kernels::{HeadTransform, InstructionSet, transform_len};
 
@@ -54,7 +50,7 @@ pub(crate) fn transform_heads(
 }
 
 /// The operation of [`transform_heads`] on a backend.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait HeadTransformOps: Backend {
     /// See [`transform_heads`].
     fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self>;
@@ -145,7 +141,8 @@ impl HeadTransformKernels for Flex {
     }
 }
 
-impl HeadTransformKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl HeadTransformKernels for burn::backend::NdArray {}
 
 #[cfg(feature = "wgpu")]
 impl HeadTransformKernels for burn::backend::Cube {}
@@ -160,7 +157,8 @@ macro_rules! head_transform_ops {
     };
 }
 head_transform_ops!(Flex);
-head_transform_ops!(NdArray);
+#[cfg(feature = "ndarray")]
+head_transform_ops!(burn::backend::NdArray);
 #[cfg(feature = "wgpu")]
 head_transform_ops!(burn::backend::Cube);
 

@@ -1,13 +1,9 @@
 //! Layer normalization and its gradient on every backend. Every norm of the model precedes a linear layer;
 //! [`norm_linear`](crate::ops::linear::norm_linear) is the operation of both.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 // B scenes, N tokens, D width
 
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
+use burn::backend::{Backend, Flex, TensorMetadata};
 use burn::tensor::Shape;
 use clift_kernels::{InstructionSet, layer_norm_backward, layer_norm_forward};
 
@@ -112,7 +108,8 @@ impl LayerNormKernels for Flex {
         [tensor(grad_x, [batch, count, dim]), tensor(grad_gamma, [dim]), tensor(grad_beta, [dim])]
     }
 }
-impl LayerNormKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl LayerNormKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl LayerNormKernels for burn::backend::Cube {}
 

@@ -2,10 +2,6 @@
 //!
 //! The result of the GELU or norm is not kept for the backward but computed again from its input: the GELU's result is
 //! the widest activation of a transformer block, and every block has two or three norms.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 // B scenes, N rows of a scene, I inputs, O outputs
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -13,7 +9,7 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::module::Param;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Tensor, assert_shape};
@@ -101,7 +97,7 @@ fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
 }
 
 /// The operations of [`linear`], [`gelu_linear`] and [`norm_linear`] on a backend.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait LinearOps: Backend {
     fn linear_layer(
         x: FloatTensor<Self>,
@@ -186,7 +182,8 @@ impl LinearKernels for Flex {
     }
 }
 
-impl LinearKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl LinearKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl LinearKernels for burn::backend::Cube {}
 
@@ -222,7 +219,8 @@ macro_rules! linear_ops {
     };
 }
 linear_ops!(Flex);
-linear_ops!(NdArray);
+#[cfg(feature = "ndarray")]
+linear_ops!(burn::backend::NdArray);
 #[cfg(feature = "wgpu")]
 linear_ops!(burn::backend::Cube);
 

@@ -6,16 +6,12 @@
 //!
 //! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
 //! forward pass. An operation reads the precision once; its backward uses that of its forward.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 
 use std::cell::Cell;
 use std::marker::PhantomData;
 
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
+use burn::backend::{Backend, Flex, TensorMetadata};
 use burn::tensor::{DType, Device, FloatDType, Tensor};
 use clift_kernels::{InstructionSet, OperandType, matmul_bf16, peak_flops};
 use serde::{Deserialize, Serialize};
@@ -176,7 +172,8 @@ impl MatmulKernels for Flex {
         tensor(output, [rows, columns])
     }
 }
-impl MatmulKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl MatmulKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl MatmulKernels for burn::backend::Cube {
     /// The kernels accumulate in f32 and write f32.

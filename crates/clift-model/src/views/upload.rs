@@ -1,7 +1,7 @@
 //! Copies images and cameras to a device.
 // B scenes, V views, H rows, W columns
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 
 use crate::error::ModelError;
 
@@ -77,7 +77,7 @@ impl Views {
     }
 }
 
-/// Copies 8-bit images to a device as RGB in `[0, 1]`.
+/// Copies 8-bit images to a device as RGB in `[0, 1]`, the same bits on every device.
 ///
 /// # Shapes
 /// - `images` and the result: `[batch, views, height, width, 3]`, with `shape` = `[batch, views, height, width]`
@@ -87,8 +87,33 @@ impl Views {
 pub fn upload_images(images: &[u8], shape: [usize; 4], device: &Device) -> Result<Tensor<5>, ModelError> {
     let [batch, views, height, width] = shape;
     check_length("images", images.len(), batch * views * height * width * 3)?;
-    let values: Vec<f32> = images.iter().map(|&value| f32::from(value) / 255.0).collect();
-    Ok(Tensor::from_data(TensorData::new(values, [batch, views, height, width, 3]), device))
+    let shape = [batch, views, height, width, 3];
+    // Flex computes in the host's memory: nothing has to be moved.
+    if *device != Device::flex() {
+        return Ok(upload_packed(images, device).reshape(shape));
+    }
+    let values: Vec<f32> = images.iter().copied().map(unit).collect();
+    Ok(Tensor::from_data(TensorData::new(values, shape), device))
+}
+
+fn unit(value: u8) -> f32 {
+    f32::from(value) / 255.0
+}
+
+/// Copies four values a word, a quarter of the bytes of f32, and scales them on the device: by a table, because divisions
+/// of GPUs need not be exact to the last bit.
+fn upload_packed(bytes: &[u8], device: &Device) -> Tensor<1> {
+    let table: Vec<f32> = (0..=u8::MAX).map(unit).collect();
+    let table: Tensor<1> = Tensor::from_data(TensorData::new(table, [256]), device);
+    let mut words = vec![0_i32; bytes.len().div_ceil(4)];
+    for (word, chunk) in words.iter_mut().zip(bytes.chunks(4)) {
+        *word = chunk.iter().rev().fold(0, |word, &byte| word << 8 | i32::from(byte));
+    }
+    let count = words.len();
+    let words: Tensor<2, Int> = Tensor::from_data(TensorData::new(words, [count, 1]), (device, DType::I32));
+    let shifts: Tensor<2, Int> = Tensor::from_data([[0, 8, 16, 24]], (device, DType::I32));
+    let values = words.bitwise_right_shift(shifts).bitwise_and_scalar(255).reshape([4 * count]);
+    table.select(0, values.narrow(0, 0, bytes.len()))
 }
 
 fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), ModelError> {
@@ -105,6 +130,21 @@ fn check_finite(name: &'static str, values: &[f32]) -> Result<(), ModelError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::devices;
+
+    #[test]
+    fn pixels_have_the_same_bits_on_every_device() {
+        // All 256 values, and a number that no word divides.
+        let bytes: Vec<u8> = (0..=u8::MAX).rev().chain(0..29).collect();
+        let expected: Vec<u32> = bytes.iter().map(|&byte| (f32::from(byte) / 255.0).to_bits()).collect();
+        for device in devices() {
+            let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+            let images = upload_images(&bytes, [1, 5, 1, 19], &device).expect("285 values");
+            assert_eq!(bits(images.try_into_vec_as().expect("f32")), expected, "{device:?}");
+            let packed = upload_packed(&bytes, &device.clone().autodiff());
+            assert_eq!(bits(packed.inner().try_into_vec_as().expect("f32")), expected, "{device:?}");
+        }
+    }
 
     #[test]
     fn wrong_lengths_and_nan_are_refused() {

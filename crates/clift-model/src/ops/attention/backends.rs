@@ -1,13 +1,9 @@
 //! The implementation of every backend: on flex, in f32 and bf16, the native kernels, which read packed projections and write
 //! packed gradients; elsewhere attention in chunks of queries.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Flex, NdArray, TensorMetadata};
+use burn::backend::{Flex, TensorMetadata};
 use clift_kernels::{
     AttentionGradients, AttentionSizes, BackwardInputs, InstructionSet, StridedRows, attention_backward,
     attention_forward,
@@ -131,6 +127,7 @@ pub trait AttentionKernels: MatmulKernels {
     }
 }
 
-impl AttentionKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl AttentionKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl AttentionKernels for burn::backend::Cube {}

@@ -3,10 +3,6 @@
 //! Under autodiff, Burn's attention keeps about three score maps per head (13.5 GiB for one scene of 4,096 tokens). The
 //! operations here keep inputs and output and compute the scores again in the backward, a chunk of queries at a time, so
 //! that memory is linear in the number of tokens.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 // B scenes, Q queries, K keys, D width, H heads, E = D/H width of a head
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -14,7 +10,7 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, backend_extension};
 use burn::tensor::{Tensor, assert_shape};
 
 use crate::ops::attention::backends::AttentionKernels;
@@ -57,7 +53,7 @@ pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> T
 }
 
 /// The operations of [`self_sdpa`] and [`cross_sdpa`] on a backend.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait AttentionOps: Backend {
     fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
     fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
@@ -81,7 +77,8 @@ macro_rules! attention_ops {
     };
 }
 attention_ops!(Flex);
-attention_ops!(NdArray);
+#[cfg(feature = "ndarray")]
+attention_ops!(burn::backend::NdArray);
 #[cfg(feature = "wgpu")]
 attention_ops!(burn::backend::Cube);
 

@@ -2,10 +2,6 @@
 //!
 //! A token is a key of one centroid only: there is one score per token and head, the softmax runs over segments, and no
 //! `[centroids, tokens]` mask exists.
-#![expect(
-    deprecated,
-    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
-)]
 // B scenes, S centroids, M members, D width, H heads, E = D/H width of a head
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -13,7 +9,7 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IndexingUpdateOp, IntTensor};
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::tensor::{FloatDType, Int, Shape, Slice, Tensor, assert_shape};
 
 use crate::ops::autodiff::register;
@@ -50,7 +46,7 @@ pub fn cluster_attention(
 }
 
 /// The operation of [`cluster_attention`] on a backend.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait ClusterAttentionOps: Backend {
     fn cluster_attention(
         query: FloatTensor<Self>,
@@ -101,11 +97,13 @@ macro_rules! cluster_attention_ops {
     };
 }
 cluster_attention_ops!(Flex);
-cluster_attention_ops!(NdArray);
+#[cfg(feature = "ndarray")]
+cluster_attention_ops!(burn::backend::NdArray);
 #[cfg(feature = "wgpu")]
 cluster_attention_ops!(burn::backend::Cube);
 
-impl ClusterAttentionKernels for NdArray {}
+#[cfg(feature = "ndarray")]
+impl ClusterAttentionKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl ClusterAttentionKernels for burn::backend::Cube {}
 

@@ -56,7 +56,7 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     rows.extend(reduced_rows);
     print_result(&device_table(rows))?;
     for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
-        print_result(&format!("\n{name} is not part of this build: cargo build --release --features {name}"))?;
+        print_result(&format!("{name} is not part of this build: cargo build --release --features {name}"))?;
     }
     match reference {
         Ok(_) => Ok(()),
@@ -65,7 +65,12 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
 }
 
 fn version() -> String {
-    let features = if cfg!(feature = "wgpu") { "wgpu" } else { "none" };
+    let features: Vec<&str> = [DeviceName::Ndarray, DeviceName::Wgpu]
+        .into_iter()
+        .filter(|name| name.is_built())
+        .map(DeviceName::as_str)
+        .collect();
+    let features = if features.is_empty() { "none".into() } else { features.join(", ") };
     let (os, arch) = (std::env::consts::OS, std::env::consts::ARCH);
     format!("{}, cargo features: {features}, {os} {arch}", env!("CARGO_PKG_VERSION"))
 }

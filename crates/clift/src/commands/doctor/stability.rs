@@ -40,7 +40,8 @@ fn markdown_head(small: bool) -> String {
     format!(
         "# Numbers on hard scenes
 
-Made by `{command} --markdown docs/results/stability.md`; a small version of every case runs in `cargo test`.
+Made by `{command} --markdown docs/results/stability.md`, with a column for each device of the
+build (`--features ndarray`, `wgpu`); a small version of every case runs in `cargo test --workspace`.
 
 Each case is a real computation in f32, compared with the same code on the same values in f64, which uses the composed
 operations instead of the kernels. The error is the largest difference over the largest value; of an update, over its
