@@ -14,7 +14,6 @@ use crate::sources::kind::SourceKind;
 use crate::sources::open::{OpenedSource, SAME_SCENES, open_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
-use crate::sources::training_frames::TrainingFrames;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 
@@ -83,7 +82,7 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
 pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<OpenedSource, DataError> {
     let mut opened = open_dataset(config, Split::Train)?;
     if opened.shares_scenes && config.hold_out > 0 {
-        opened.source = Arc::new(TrainingFrames::new(opened.source, config.hold_out));
+        opened.source = Arc::new(SceneSubset::without_held_out(opened.source, config.hold_out));
     }
     let source = opened.source.clone();
     let needed = config.views.min_frames(last_step);

@@ -9,12 +9,10 @@ use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
 use crate::support::{
-    BINARY, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
+    BINARY, LONGER, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
 };
 
-/// A run whose methods differ by more than rounding.
-static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
-/// The same with camera-relative attention.
+/// [`LONGER`] with camera-relative attention.
 static RELATIVE: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20", "model.camera_encoding=\"gta\""]);
 
 const KEY: &str = "synthetic-0-test-00000";
