@@ -109,11 +109,11 @@ mod tests {
     use crate::random::item_rng;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+    use crate::testing::rooms;
 
     #[test]
     fn training_skips_scenes_too_short_for_its_last_step() {
-        let rooms =
-            SyntheticSource::new(SyntheticConfig { num_frames: 8, num_scenes: 2, ..Default::default() }).unwrap();
+        let rooms = rooms(|c| (c.num_scenes, c.num_frames) = (2, 8));
         let folder = tempfile::tempdir().unwrap();
         let record = |(scene, num_frames): (usize, usize)| {
             Ok(SceneRecord {

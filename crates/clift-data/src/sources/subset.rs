@@ -104,13 +104,12 @@ impl SceneSource for SceneSubset {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::config::SyntheticConfig;
-    use crate::synthetic::source::SyntheticSource;
+    use crate::testing::rooms;
 
     #[test]
     fn training_has_all_frames_but_the_held_out() {
         for (every, num_frames) in [(2, 7), (3, 9), (8, 16), (8, 17), (8, 3)] {
-            let whole = Arc::new(SyntheticSource::new(SyntheticConfig { num_frames, ..Default::default() }).unwrap());
+            let whole = Arc::new(rooms(|c| c.num_frames = num_frames));
             let training = SceneSubset::without_held_out(whole.clone(), every);
             let expected: Vec<usize> = (0..num_frames).filter(|frame| frame % every != 0).collect();
             assert_eq!(training.num_frames(0).unwrap(), expected.len());
