@@ -75,14 +75,14 @@ fn scene_files_reproduce_the_evaluation() {
         json!({"c2w": rows})
     });
     place.write("poses.json", json!({"poses": poses.collect::<Vec<_>>()}).to_string());
-    for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
+    for (count, format) in [4, 8].into_iter().flat_map(|count| TokenFormat::ALL.map(|format| (count, format))) {
+        let storage = format.name();
         let name = format!("{count}-{storage}.clift");
         let flags = format!("--context 0,7 --storage {count} --tokens {storage}");
         let ran = place.clift(&format!("{ENCODE} DIR/{name} {flags}")).ok();
         ran.prints(&format!("{count} of 8 tokens (clift, {storage})"));
 
         // The file's size is that of the formula, and of the evaluation's summary.
-        let format: TokenFormat = storage.parse().unwrap();
         let (scene, found) = Scene::read(&place.at(&name)).unwrap();
         assert_eq!((scene.num_tokens(), scene.kind, found), (count, TokenKind::Clift, TokenCoding::Plain(format)));
         assert_eq!(scene.context_frames, [0, 7]);
