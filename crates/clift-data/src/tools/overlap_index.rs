@@ -142,7 +142,7 @@ pub fn write_overlap_index(
         }
         shared.push(key);
     }
-    let notes = note_on(&shared, "scene", "in both splits, counted once").into_iter().collect();
+    let notes = note_on(&shared, "in both splits, counted once").into_iter().collect();
     let sample = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.sample_views(source.key(*scene), &cameras)
