@@ -109,6 +109,8 @@ pub struct Shared {
 /// The whole micro run, with its evaluation.
 pub static WHOLE: Shared = Shared::new("run", &[]);
 pub static STAGE_1: Shared = Shared::new("run --only stage1", &[]);
+/// A run whose renderings depend on the tokens, and whose methods differ by more than rounding.
+pub static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
 
 impl Shared {
     /// The micro run `run` with flags and changed keys, see [`Place::train`].

@@ -14,7 +14,6 @@ use crate::sources::kind::SourceKind;
 use crate::sources::open::{OpenedSource, SAME_SCENES, open_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
-use crate::sources::training_frames::TrainingFrames;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 
@@ -83,7 +82,7 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
 pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<OpenedSource, DataError> {
     let mut opened = open_dataset(config, Split::Train)?;
     if opened.shares_scenes && config.hold_out > 0 {
-        opened.source = Arc::new(TrainingFrames::new(opened.source, config.hold_out));
+        opened.source = Arc::new(SceneSubset::without_held_out(opened.source, config.hold_out));
     }
     let source = opened.source.clone();
     let needed = config.views.min_frames(last_step);
@@ -110,11 +109,11 @@ mod tests {
     use crate::random::item_rng;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+    use crate::testing::rooms;
 
     #[test]
     fn training_skips_scenes_too_short_for_its_last_step() {
-        let rooms =
-            SyntheticSource::new(SyntheticConfig { num_frames: 8, num_scenes: 2, ..Default::default() }).unwrap();
+        let rooms = rooms(|c| (c.num_scenes, c.num_frames) = (2, 8));
         let folder = tempfile::tempdir().unwrap();
         let record = |(scene, num_frames): (usize, usize)| {
             Ok(SceneRecord {

@@ -120,9 +120,9 @@ impl fmt::Display for SkipReport {
     }
 }
 
-/// Returns a note on these names, such as `2 scenes unreadable now (a, b)`; `None` for no names.
-pub(crate) fn note_on<S: AsRef<str>>(names: &[S], noun: &str, what: &str) -> Option<String> {
-    (!names.is_empty()).then(|| format!("{} {what} ({})", plural(names.len(), noun), first_few(names)))
+/// Returns a note on these scenes, such as `2 scenes unreadable now (a, b)`; `None` for none.
+pub(crate) fn note_on<S: AsRef<str>>(keys: &[S], what: &str) -> Option<String> {
+    (!keys.is_empty()).then(|| format!("{} {what} ({})", plural(keys.len(), "scene"), first_few(keys)))
 }
 
 /// Joins the first few names, with dots for the others.

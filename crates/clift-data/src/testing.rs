@@ -10,6 +10,8 @@ use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::filters::SceneFilters;
+use crate::synthetic::config::SyntheticConfig;
+use crate::synthetic::source::SyntheticSource;
 
 pub fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures").join(name)
@@ -18,6 +20,13 @@ pub fn fixture(name: &str) -> PathBuf {
 /// Returns two training scenes, or one test scene, of RealEstate10K with eight frames.
 pub fn re10k_mini(split: Split) -> ChunkSource {
     ChunkSource::open(&fixture("re10k-mini"), split, &SceneFilters::default()).unwrap()
+}
+
+/// Returns synthetic scenes; `change` departs from 32 x 32 pixels, 16 frames and 100 scenes.
+pub fn rooms(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
+    let mut config = SyntheticConfig::default();
+    change(&mut config);
+    SyntheticSource::new(config).unwrap()
 }
 
 /// Passes a file with these bytes to `read`.

@@ -1,7 +1,6 @@
 //! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
-use burn::tensor::Tensor;
 use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
 use clift_model::{
     Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneModel, SceneNormalization, TokenCount,
@@ -98,7 +97,9 @@ pub fn encode(
         }
         (Clusters::new(vec![SceneClusters::identity(num_lift_tokens)])?, 0.0)
     } else {
-        cluster(&options.kmeans, &lift.values, options.storage, seed)?
+        let fit = options.kmeans.fit(lift.values.clone(), options.storage.of(num_lift_tokens)?, &[seed])?;
+        let error = fit.error(0, total_variance(&lift.values)?[0]);
+        (fit.clusters, error)
     };
     let index = clusters.upload(&model.device);
     let (kind, tokens) = if model.config.has_latents() {
@@ -156,43 +157,9 @@ fn bad_config(key: &'static str, value: String, fix: String) -> EvalError {
     ModelError::BadConfig { key, value, fix }.into()
 }
 
-/// Returns the clusters, and the variance within clusters as a share of the total variance.
-fn cluster(kmeans: &KMeans, lift: &Tensor<3>, storage: TokenCount, seed: u64) -> Result<(Clusters, f64), EvalError> {
-    let [_, num_tokens, _] = lift.dims();
-    let fit = kmeans.fit(lift.clone(), storage.of(num_tokens)?, &[seed])?;
-    let error = fit.error(0, total_variance(lift)?[0]);
-    Ok((fit.clusters, error))
-}
-
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{Device, TensorData};
-
     use super::*;
-
-    /// Tokens of two values in two distant groups, with a little noise.
-    fn tokens(num_tokens: usize) -> Tensor<3> {
-        let value = |i: usize| [(i % 2) as f32 * 10.0, ((i * 7919) % 101) as f32 * 1e-3];
-        let values: Vec<f32> = (0..num_tokens).flat_map(value).collect();
-        Tensor::from_data(TensorData::new(values, [1, num_tokens, 2]), &Device::flex())
-    }
-
-    #[test]
-    fn the_error_is_the_share_of_variance_within_clusters() {
-        let lift = tokens(64);
-        let values: Vec<f32> = lift.to_data().try_to_vec().unwrap();
-        let rows: Vec<[f64; 2]> = values.chunks(2).map(|row| [f64::from(row[0]), f64::from(row[1])]).collect();
-        let spread = |rows: &[[f64; 2]]| {
-            let mean = [0, 1].map(|i| rows.iter().map(|row| row[i]).sum::<f64>() / rows.len() as f64);
-            rows.iter().flat_map(|row| [row[0] - mean[0], row[1] - mean[1]]).map(|d| d * d).sum::<f64>()
-        };
-        let (even, odd): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row[0] == 0.0);
-        let expected = (spread(&even) + spread(&odd)) / spread(&rows);
-        let (_, error) = cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap();
-        assert!((error / expected - 1.0).abs() < 1e-3, "{error} against {expected}"); // f32
-        let lift = Tensor::<3>::ones([1, 8, 2], &Device::flex());
-        assert_eq!(cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap().1, 0.0);
-    }
 
     #[test]
     fn context_frames_are_checked_or_spread() {

@@ -70,7 +70,7 @@ pub use report::training::TrainingCurve;
 pub use sweep::eval_models::{EvalModels, stage2_method};
 pub use sweep::evaluate_scene::evaluate_scene;
 pub use sweep::held_out_frame::HeldOutFrame;
-pub use sweep::predictions::ExternalMethod;
+pub use sweep::predictions::{ExternalMethod, file_name};
 pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;
 

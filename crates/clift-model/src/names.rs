@@ -62,8 +62,8 @@ mod tests {
         check::<DeviceName>("flex, ndarray, wgpu");
         check::<Precision>("f32, bf16, f16");
         check::<SelectionPreset>("paper, global, scaled");
-        check::<TokenFormat>("f32, f16, int8");
         check::<CliftVariant>("paper, released-re10k, released-dl3dv");
+        assert_eq!(names::<TokenFormat>(), "f32, f16, int8");
         assert_eq!(names::<TokenKind>(), "clift, kmeans, latents");
         let message = parse_value::<FlopConvention>("convention", "flop").unwrap_err().to_string();
         assert_eq!(message, "`convention` = flop: write one of paper, macs, flops");

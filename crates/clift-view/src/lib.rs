@@ -5,7 +5,7 @@
 //!
 //! ```no_run
 //! use clift_model::{DeviceName, Scene, load_renderer};
-//! use clift_view::{SceneFile, SceneSet, ServerOptions, ViewServer};
+//! use clift_view::{SceneFile, SceneSet, ViewServer};
 //!
 //! let device = DeviceName::Flex.open()?;
 //! let (scene, coding) = Scene::read("room.clift".as_ref())?;
@@ -13,7 +13,7 @@
 //! let renderer = load_renderer(&scene, "runs/tiny/stage2/model.safetensors".as_ref(), &device)?;
 //! let render_args = vec!["room.clift".into()];
 //! let scenes = SceneSet::File(Box::new(SceneFile { scene, coding, file_bytes, renderer, render_args }));
-//! let server = ViewServer::bind(&ServerOptions::default())?;
+//! let server = ViewServer::bind("127.0.0.1:0".parse()?)?;
 //! println!("{}", server.url());
 //! server.run(scenes, DeviceName::Flex)?;
 //! # Ok::<(), Box<dyn std::error::Error>>(())
@@ -27,4 +27,4 @@ mod session;
 
 pub use error::ViewError;
 pub use scenes::scene_set::{RunScenes, SceneFile, SceneSet};
-pub use server::view_server::{ServerOptions, ViewServer};
+pub use server::view_server::ViewServer;

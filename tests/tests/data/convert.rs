@@ -1,6 +1,6 @@
 //! `clift data convert`: refused targets, skipped scenes, splits.
 
-use clift_data::{ChunkSource, SceneFilters, SceneRecord, SceneSource, Split, write_chunks};
+use clift_data::{ChunkSource, ImageEncoding, SceneFilters, SceneRecord, Split, read_scene, write_chunks};
 
 use crate::support::{Place, copy_folder, repository};
 
@@ -71,26 +71,24 @@ fn scenes_skipped_at_opening_are_listed() {
     assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
 }
 
-/// Writes a scene of the test split whose images are changed.
-fn write_changed(place: &Place, key: &str, change: impl Fn(usize, Vec<u8>) -> Vec<u8>) {
-    let source =
-        ChunkSource::open(&repository("data-fixtures/re10k-mini"), Split::Test, &SceneFilters::default()).unwrap();
-    let cameras = source.cameras(0).unwrap();
-    let image = |frame| change(frame, source.encoded_frame(0, frame).unwrap().unwrap());
-    let images = (0..cameras.len()).map(image).collect();
-    let timestamps = source.timestamps(0).unwrap();
-    let record = SceneRecord { key: key.into(), url: String::new(), timestamps, cameras, images };
+/// Writes the scene of the test split, changed.
+fn write_changed(place: &Place, key: &str, change: impl Fn(&mut SceneRecord)) {
+    let mini = repository("data-fixtures/re10k-mini");
+    let source = ChunkSource::open(&mini, Split::Test, &SceneFilters::default()).unwrap();
+    let (mut record, _) = read_scene(&source, 0, ImageEncoding::Png, None).unwrap();
+    record.key = key.into();
+    change(&mut record);
     write_chunks(&place.at("data/test"), [Ok(record)], 1).unwrap();
 }
 
 #[test]
 fn unreadable_images_are_counted_and_fail() {
     let place = Place::new();
-    write_changed(&place, "kitchen", |frame, image| match frame {
-        1 => image[..image.len() / 2].to_vec(),
-        3 => b"RIFF....WEBPVP8 ".to_vec(),
-        6 => Vec::new(),
-        _ => image,
+    write_changed(&place, "kitchen", |scene| {
+        let half = scene.images[1].len() / 2;
+        scene.images[1].truncate(half);
+        scene.images[3] = b"RIFF....WEBPVP8 ".to_vec();
+        scene.images[6].clear();
     });
     // A second run finds the same images in the finished folder.
     for written in ["8 frames written, 8 copied and 0 encoded, 3 unreadable", "0 frames written"] {
@@ -106,7 +104,7 @@ fn unreadable_images_are_counted_and_fail() {
 #[test]
 fn control_characters_of_keys_do_not_reach_the_terminal() {
     let place = Place::new();
-    write_changed(&place, "a\u{1b}[2J\u{7}b\nc", |_, _| Vec::new());
+    write_changed(&place, "a\u{1b}[2J\u{7}b\nc", |scene| scene.images.iter_mut().for_each(Vec::clear));
     let ran = place.clift("data check DIR/data").prints("test/a\\u{1b}[2J\\u{7}b\\nc  8");
     assert!(!ran.stdout.contains(['\u{1b}', '\u{7}']) && !ran.stderr.contains(['\u{1b}', '\u{7}']), "{}", ran.stdout);
     let ran = place.clift("data convert DIR/data DIR/out --to chunks").notes("scene a\\u{1b}[2J\\u{7}b\\nc: ");
@@ -116,20 +114,12 @@ fn control_characters_of_keys_do_not_reach_the_terminal() {
 #[test]
 fn conversion_and_check_without_scenes_fail() {
     let place = Place::new();
-    let source =
-        ChunkSource::open(&repository("data-fixtures/re10k-mini"), Split::Test, &SceneFilters::default()).unwrap();
-    let mut cameras = source.cameras(0).unwrap();
-    cameras[0].c2w.translation[0] = f64::NAN;
-    let images = (0..cameras.len()).map(|frame| source.encoded_frame(0, frame).unwrap().unwrap()).collect();
-    let timestamps = source.timestamps(0).unwrap();
-    let record = SceneRecord { key: "torn".into(), url: String::new(), timestamps, cameras, images };
-    let data = place.at("data");
-    write_chunks(&data.join("test"), [Ok(record)], 1).unwrap();
+    write_changed(&place, "torn", |scene| scene.cameras[0].c2w.translation[0] = f64::NAN);
     let ran = place.clift("data convert DIR/data DIR/out --to chunks").prints("0 scenes of 1");
     ran.fails_with(1, &["skipped torn: ", "no scene of test could be converted"]);
     assert!(!place.at("out/test/index.json").exists());
 
-    std::fs::remove_file(data.join("test/000000.torch")).unwrap();
+    std::fs::remove_file(place.at("data/test/000000.torch")).unwrap();
     place.write("data/test/index.json", "{}");
     place.clift("data check DIR/data").fails_with(1, &["no scenes to check"]);
 }

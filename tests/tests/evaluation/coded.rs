@@ -2,10 +2,7 @@
 
 use clift_model::{Scene, TokenCodec, TokenCoding};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, list, number};
-
-/// A run whose renderings depend on the tokens.
-static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
+use crate::support::{LONGER, Place, STAGE_1, WHOLE, list, number};
 
 const KEY: &str = "synthetic-0-test-00000";
 const CODEC: &str = "run/stage2/codec.safetensors";

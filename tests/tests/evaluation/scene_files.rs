@@ -9,12 +9,10 @@ use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
 use crate::support::{
-    BINARY, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
+    BINARY, LONGER, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
 };
 
-/// A run whose methods differ by more than rounding.
-static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
-/// The same with camera-relative attention.
+/// [`LONGER`] with camera-relative attention.
 static RELATIVE: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20", "model.camera_encoding=\"gta\""]);
 
 const KEY: &str = "synthetic-0-test-00000";
@@ -22,8 +20,8 @@ const KEY: &str = "synthetic-0-test-00000";
 const ENCODE: &str = "encode DIR/run --scene synthetic-0-test-00000 --out";
 
 /// The first test scene with the views that `clift eval` gives it.
-fn first_clip(place: &Place, run: &str) -> (Clip, ClipReader) {
-    let config: Config = read_config(&place.at(run).join("config.toml"), &[]).expect("a run's config").0;
+fn first_clip(place: &Place) -> (Clip, ClipReader) {
+    let config: Config = read_config(&place.at("run/config.toml"), &[]).expect("a run's config").0;
     let source = open_dataset(&config.data, Split::Test).expect("the run's rooms").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = even_views(8, config.eval.num_context, config.eval.num_targets).expect("enough frames");
@@ -70,21 +68,21 @@ fn drawn(mut scene: SceneRenderer, clip: &Clip, num_render_tokens: usize) -> Vec
 #[test]
 fn scene_files_reproduce_the_evaluation() {
     let place = Place::with(&LONGER);
-    let (clip, reader) = first_clip(&place, "run");
+    let (clip, reader) = first_clip(&place);
     let cameras = reader.source.cameras(0).expect("cameras");
     let poses = clip.target.frame_index.iter().map(|&frame| {
         let rows: Vec<Vec<f64>> = cameras[frame].c2w.to_matrix_f64().chunks(4).map(<[f64]>::to_vec).collect();
         json!({"c2w": rows})
     });
     place.write("poses.json", json!({"poses": poses.collect::<Vec<_>>()}).to_string());
-    for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
+    for (count, format) in [4, 8].into_iter().flat_map(|count| TokenFormat::ALL.map(|format| (count, format))) {
+        let storage = format.name();
         let name = format!("{count}-{storage}.clift");
         let flags = format!("--context 0,7 --storage {count} --tokens {storage}");
         let ran = place.clift(&format!("{ENCODE} DIR/{name} {flags}")).ok();
         ran.prints(&format!("{count} of 8 tokens (clift, {storage})"));
 
         // The file's size is that of the formula, and of the evaluation's summary.
-        let format: TokenFormat = storage.parse().unwrap();
         let (scene, found) = Scene::read(&place.at(&name)).unwrap();
         assert_eq!((scene.num_tokens(), scene.kind, found), (count, TokenKind::Clift, TokenCoding::Plain(format)));
         assert_eq!(scene.context_frames, [0, 7]);
@@ -125,7 +123,7 @@ fn scene_files_reproduce_the_evaluation() {
 fn evaluation_of_selected_tokens_equals_rendering_the_file() {
     for run in [&LONGER, &RELATIVE] {
         let place = Place::with(run);
-        let (clip, _) = first_clip(&place, "run");
+        let (clip, _) = first_clip(&place);
         place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 4 --tokens f32")).ok();
         for preset in SelectionPreset::ALL {
             let name = preset.name();
@@ -311,7 +309,7 @@ fn encode_compares_a_frame_that_is_no_context() {
     let check = ran.stdout.lines().find(|line| line.starts_with("check: frame 3, not a context: ")).expect("a check");
     let decibels: Vec<f64> = check.split(' ').filter_map(|word| word.parse().ok()).collect();
     // The frame of the scene file, rendered as `clift eval` does.
-    let (mut clip, reader) = first_clip(&place, "run");
+    let (mut clip, reader) = first_clip(&place);
     clip.target = reader.read(0, &ViewIndices { context: vec![0, 7], target: vec![3] }).unwrap().target;
     let rendered = drawn(open(&place, "room.clift", SelectionPreset::Paper), &clip, 8);
     let expected = measure(&clip, &rendered)[0].0;

@@ -1,6 +1,6 @@
 //! What the figures of an evaluation were measured on: splits, held-out frames, targets that are also contexts.
 
-use clift_data::{SceneRecord, SceneSource, SyntheticConfig, SyntheticSource, encode_png, write_chunks};
+use clift_data::{ImageEncoding, SyntheticConfig, SyntheticSource, read_scene, write_chunks};
 use serde_json::json;
 
 use crate::support::{Place, STAGE_1, number, repository};
@@ -75,10 +75,8 @@ fn scene_key_of_5000_letters_has_a_sheet() {
     let place = Place::with(&STAGE_1);
     let rooms = SyntheticConfig { num_scenes: 1, num_frames: 8, width: 16, height: 16, ..Default::default() };
     let rooms = SyntheticSource::new(rooms).unwrap();
-    let images = (0..8).map(|frame| encode_png(&rooms.frame(0, frame).unwrap()).unwrap()).collect();
-    let cameras = rooms.cameras(0).unwrap();
-    let record =
-        SceneRecord { key: "k".repeat(5000), url: String::new(), timestamps: (0..8).collect(), cameras, images };
+    let (mut record, _) = read_scene(&rooms, 0, ImageEncoding::Png, None).unwrap();
+    record.key = "k".repeat(5000);
     write_chunks(&place.at("long"), [Ok(record)], 1).unwrap();
     place.eval("run --data DIR/long --out DIR/out").ok();
     let sheets = place.names("out/sheets");

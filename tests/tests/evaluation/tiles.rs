@@ -5,16 +5,16 @@ use crate::support::{Place, WHOLE, list, number, point};
 /// At least one tile per view.
 const STORAGE: &str = "eval.validation_storage=0.5";
 
-/// Trains stage 2 of the run `name` on tiles, from the stage 1 of `run`.
-fn train_on_tiles(place: &Place, name: &str) {
+/// Trains stage 2 of the run `tiles` on tiles, from the stage 1 of `run`.
+fn train_on_tiles(place: &Place) {
     let from = format!("stage1.init_from=\"{}\"", place.at("run").display());
-    place.train(name, &["stage1.steps=0", &from, "clusters.grouping=\"tile\"", STORAGE]).ok();
+    place.train("tiles", &["stage1.steps=0", &from, "clusters.grouping=\"tile\"", STORAGE]).ok();
 }
 
 #[test]
 fn tiles_and_clusters_have_paired_differences() {
     let place = Place::with(&WHOLE);
-    train_on_tiles(&place, "tiles");
+    train_on_tiles(&place);
     let words = "run --preset patchwise --with DIR/tiles --storage 1/2 --out DIR/out";
     place.eval(words).ok().prints("kmeans - patch").prints("patch_clift");
     let summary = place.json("out/summary.json");
@@ -42,7 +42,7 @@ fn tiles_and_clusters_have_paired_differences() {
 #[test]
 fn tile_runs_encode_nothing_and_refuse_their_kind() {
     let place = Place::with(&WHOLE);
-    train_on_tiles(&place, "tiles");
+    train_on_tiles(&place);
     place
         .train("few", &["clusters.grouping=\"tile\""])
         .fails_with(2, &["eval.validation_storage", "at least one tile for every context view"]);

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{ChunkSource, SceneFilters, SceneRecord, SceneSource, Split, write_chunks};
+use clift_data::{ChunkSource, ImageEncoding, SceneFilters, SceneRecord, SceneSource, Split, read_scene, write_chunks};
 
 use crate::support::{Place, Ran, STAGE_1, WHOLE, copy_folder, files, list, number, repository};
 
@@ -43,15 +43,7 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> PathBuf {
     copy_folder(&repository(MINI).join("test"), &data.join("test"));
     let source = ChunkSource::open(&repository(MINI), Split::Train, &SceneFilters::default()).unwrap();
     let scenes = (0..source.num_scenes()).map(|scene| {
-        let frames = 0..source.num_frames(scene)?;
-        let images = frames.filter_map(|frame| source.encoded_frame(scene, frame).transpose());
-        let mut record = SceneRecord {
-            key: source.key(scene).into(),
-            url: source.url(scene)?,
-            timestamps: source.timestamps(scene)?,
-            cameras: source.cameras(scene)?,
-            images: images.collect::<Result<_, _>>()?,
-        };
+        let (mut record, _) = read_scene(&source, scene, ImageEncoding::Png, None)?;
         if record.key == KEYS[1] {
             change(&mut record);
         }

@@ -67,7 +67,7 @@ fn idle_and_closed_tabs_cost_nothing() {
     assert!(used(&viewer, 2.0) <= 0.02, "an idle tab");
     // Cameras without end, and a tab that goes away in the middle.
     tab.frame_rate(1, 0.5);
-    tab.send_view(1, false);
+    tab.send_view(1);
     drop(tab);
     std::thread::sleep(Duration::from_secs(1));
     assert!(used(&viewer, 2.0) <= 0.02, "a closed tab");
@@ -96,7 +96,7 @@ fn a_stalled_tab_gets_two_frames() {
     let viewer = Viewer::start(&["run"], &place.at(""));
     let mut tab = Tab::open(&viewer);
     for _ in 0..50 {
-        tab.send_view(1, false);
+        tab.send_view(1);
         std::thread::sleep(Duration::from_millis(2));
     }
     let seqs = [tab.reply().0, tab.reply().0].map(|header| header["seq"].as_u64().expect("a number"));

@@ -118,7 +118,7 @@ impl Tab {
         (serde_json::from_slice(header).expect("JSON"), parts.to_vec())
     }
 
-    pub fn send_view(&mut self, tokens: u64, is_rest: bool) {
+    pub fn send_view(&mut self, tokens: u64) {
         self.seq += 1;
         let context = &self.scene["context"][0];
         let mut c2w: Vec<f64> = context["c2w"].as_array().expect("rows").iter().filter_map(Value::as_f64).collect();
@@ -126,7 +126,7 @@ impl Tab {
         let view = json!({
             "type": "view", "seq": self.seq, "c2w": c2w, "intrinsics": context["intrinsics"], "tokens": tokens,
             "selection": "scaled", "precision": "f32", "size": self.scene["default_size"], "budget_ms": null,
-            "rest": is_rest, "list_tokens": false,
+            "rest": false, "list_tokens": false,
         });
         self.send(&view);
     }
@@ -138,7 +138,7 @@ impl Tab {
     /// Moves the camera and waits for its picture.
     pub fn picture(&mut self, tokens: u64) -> Picture {
         let started = Instant::now();
-        self.send_view(tokens, false);
+        self.send_view(tokens);
         let (header, _) = self.reply();
         let latency_ms = 1e3 * started.elapsed().as_secs_f64();
         assert_eq!(header["type"], "frame", "{header}");
@@ -151,13 +151,13 @@ impl Tab {
     pub fn frame_rate(&mut self, tokens: u64, seconds: f64) -> f64 {
         let started = Instant::now();
         let mut count = 0;
-        self.send_view(tokens, false);
-        self.send_view(tokens, false);
+        self.send_view(tokens);
+        self.send_view(tokens);
         while started.elapsed().as_secs_f64() < seconds {
             let (header, _) = self.reply();
             count += 1;
             self.acknowledge(&header);
-            self.send_view(tokens, false);
+            self.send_view(tokens);
         }
         let rate = f64::from(count) / started.elapsed().as_secs_f64();
         self.drain();

@@ -209,9 +209,7 @@ pub fn even_views_of(
 mod tests {
     use super::*;
     use crate::scene_source::Split;
-    use crate::synthetic::config::SyntheticConfig;
-    use crate::synthetic::source::SyntheticSource;
-    use crate::testing::{TestSource, fixture, re10k_mini, read_from_file};
+    use crate::testing::{TestSource, fixture, re10k_mini, read_from_file, rooms};
 
     fn index(json: &str) -> Result<EvaluationIndex, DataError> {
         read_from_file("index.json", json, EvaluationIndex::read)
@@ -256,7 +254,7 @@ mod tests {
 
     #[test]
     fn context_targets_are_counted_and_removed() {
-        let source = SyntheticSource::new(SyntheticConfig { num_scenes: 2, ..Default::default() }).unwrap();
+        let source = rooms(|c| c.num_scenes = 2);
         let (a, b) = (source.key(0), source.key(1));
         let text = format!(
             r#"{{"{a}": {{"context": [0, 5], "target": [5, 2, 0]}}, "{b}": {{"context": [0, 5], "target": [0]}}}}"#
@@ -291,9 +289,8 @@ mod tests {
 
     #[test]
     fn unusable_entries_are_skipped_up_to_the_limit() {
-        let config = SyntheticConfig { num_scenes: 5, num_frames: 8, ..Default::default() };
         let broken = || DataError::BadCamera { what: "the pose holds NaN".into() };
-        let source = TestSource::new(SyntheticSource::new(config).unwrap())
+        let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (5, 8)))
             .with_cameras(move |scene, cameras| if scene == 1 { Err(broken()) } else { Ok(cameras) });
         let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8
         let entries: Vec<String> = (0..5)

@@ -50,9 +50,8 @@ mod tests {
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::clip_reader::{ClipOptions, ClipReader};
     use crate::scene_source::SceneSource;
-    use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
-    use crate::testing::TestSource;
+    use crate::testing::{TestSource, rooms};
     use std::sync::Arc;
 
     fn mirrored(source: SyntheticSource) -> TestSource {
@@ -71,8 +70,7 @@ mod tests {
     }
 
     fn room() -> SyntheticSource {
-        let config = SyntheticConfig { num_scenes: 1, num_frames: 9, width: 40, height: 24, ..Default::default() };
-        SyntheticSource::new(config).unwrap()
+        rooms(|c| (c.num_scenes, c.num_frames, c.width, c.height) = (1, 9, 40, 24))
     }
 
     fn read(source: Arc<dyn SceneSource>, size: [usize; 2], rotation: PoseRotation) -> Clip {

@@ -5,8 +5,7 @@
 //! - `filters`: filters of scenes
 //! - `keys`: scene keys: DL3DV hashes, look-up
 //! - `test_scenes`: scenes reserved for testing
-//! - `subset`: some scenes of a source
-//! - `training_frames`: scenes without the frames held out of training
+//! - `subset`: some scenes of a source, or scenes without the frames held out of training
 //! - `dataset_root`: split folders, detection of the layout
 //! - `open`: opening any layout as a source
 //! - `chunks`: pixelSplat chunks
@@ -22,4 +21,3 @@ pub(crate) mod options;
 pub(crate) mod photos;
 pub(crate) mod subset;
 pub(crate) mod test_scenes;
-pub(crate) mod training_frames;

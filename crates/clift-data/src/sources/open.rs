@@ -60,18 +60,23 @@ pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) ->
     // With an empty list, both splits are the same scenes.
     let list = list.filter(|list| list.num_scenes() > 0);
     let folder = SplitFolder::find(root, split)?;
-    let mut opened = match folder.detect(options.kind)? {
-        DetectedSource::Torch(kind) => folder.open_torch(kind, options, list.as_ref())?,
+    let list = list.as_ref();
+    let (kind, (source, mut report)) = match folder.detect(options.kind)? {
+        DetectedSource::Torch(kind) => (kind, folder.open_torch(kind, options, list)?),
         DetectedSource::Photos(kind, scenes, report) => {
-            folder.open_photos(kind, scenes, report, options, list.as_ref())?
+            (kind, folder.open_photos(kind, scenes, report, options, list)?)
         }
     };
-    opened.shares_scenes = !opened.has_splits && list.is_none();
-    if opened.shares_scenes {
-        opened.report.notes.push(SAME_SCENES.into());
+    let has_splits = root.has_splits;
+    let shares_scenes = !has_splits && list.is_none();
+    if shares_scenes {
+        report.notes.push(SAME_SCENES.into());
     }
-    Ok(opened)
+    Ok(OpenedSource { source, kind, has_splits, shares_scenes, report })
 }
+
+/// A source with what it skipped.
+type Opened = (Arc<dyn SceneSource>, SkipReport);
 
 impl SplitFolder<'_> {
     fn open_torch(
@@ -79,7 +84,7 @@ impl SplitFolder<'_> {
         kind: SourceKind,
         options: &SourceOptions,
         list: Option<&TestScenes>,
-    ) -> Result<OpenedSource, DataError> {
+    ) -> Result<Opened, DataError> {
         let mut report = SkipReport::default();
         let index = if kind == SourceKind::Chunks {
             let index = read_index(&self.base.join("index.json"))?;
@@ -102,13 +107,7 @@ impl SplitFolder<'_> {
             source.record_unlisted(&self.base, &index);
         }
         report.append(source.report.clone());
-        Ok(OpenedSource {
-            source: Arc::new(source),
-            kind,
-            has_splits: self.root.has_splits,
-            shares_scenes: false,
-            report,
-        })
+        Ok((Arc::new(source), report))
     }
 
     fn open_photos(
@@ -118,7 +117,7 @@ impl SplitFolder<'_> {
         mut report: SkipReport,
         options: &SourceOptions,
         list: Option<&TestScenes>,
-    ) -> Result<OpenedSource, DataError> {
+    ) -> Result<Opened, DataError> {
         let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
         let mut kept = self.divide(list, &keys, options, &mut report).into_iter();
@@ -138,13 +137,7 @@ impl SplitFolder<'_> {
         };
         let source = PhotoSource::open(scenes, &source_options)?;
         report.append(source.report.clone());
-        Ok(OpenedSource {
-            source: Arc::new(source),
-            kind,
-            has_splits: self.root.has_splits,
-            shares_scenes: false,
-            report,
-        })
+        Ok((Arc::new(source), report))
     }
 
     /// Returns the clips of RealEstate10K as text files, with the folders of their frames.

@@ -1,4 +1,4 @@
-//! A subset of the scenes of a source.
+//! Some of the scenes of a source, or some of their frames.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,26 +8,49 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
-/// A subset of the scenes of a source, in the given order.
+/// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
+/// With 0 no frame is.
+pub fn is_held_out(frame: usize, every: usize) -> bool {
+    every > 0 && frame.is_multiple_of(every)
+}
+
+/// Some scenes of a source in the given order, with all frames or those of training.
 pub struct SceneSubset {
     source: Arc<dyn SceneSource>,
     /// Indices in `source`.
     scenes: Vec<usize>,
     /// Indices in this subset by those in `source`.
     positions: HashMap<usize, usize>,
+    /// Every how many frames one is left out ([`is_held_out`]), 0 or at least 2; the other frames are renumbered.
+    hold_out: usize,
 }
 
 impl SceneSubset {
     /// Keeps the scenes with these indices, which must exist in the source.
     pub fn new(source: Arc<dyn SceneSource>, scenes: Vec<usize>) -> Self {
         let positions = scenes.iter().enumerate().map(|(position, scene)| (*scene, position)).collect();
-        Self { source, scenes, positions }
+        Self { source, scenes, positions, hold_out: 0 }
     }
 
     /// Keeps at most the first `num_scenes` scenes.
     pub fn first(source: Arc<dyn SceneSource>, num_scenes: usize) -> Self {
         let scenes = (0..num_scenes.min(source.num_scenes())).collect();
         Self::new(source, scenes)
+    }
+
+    /// Keeps all scenes without their held-out frames.
+    pub(crate) fn without_held_out(source: Arc<dyn SceneSource>, hold_out: usize) -> Self {
+        Self { hold_out, ..Self::first(source, usize::MAX) }
+    }
+
+    /// Returns the number of a kept frame in the source.
+    fn frame_in_source(&self, frame: usize) -> usize {
+        if self.hold_out == 0 { frame } else { frame + 1 + frame / (self.hold_out - 1) }
+    }
+
+    fn kept<T>(&self, values: Vec<T>) -> Vec<T> {
+        let kept = values.into_iter().enumerate().filter(|(frame, _)| !is_held_out(*frame, self.hold_out));
+        kept.map(|(_, value)| value).collect()
     }
 }
 
@@ -45,15 +68,16 @@ impl SceneSource for SceneSubset {
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        self.source.num_frames(self.scenes[scene])
+        let num_frames = self.source.num_frames(self.scenes[scene])?;
+        Ok(if self.hold_out == 0 { num_frames } else { num_frames - num_frames.div_ceil(self.hold_out) })
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        self.source.cameras(self.scenes[scene])
+        Ok(self.kept(self.source.cameras(self.scenes[scene])?))
     }
 
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        self.source.timestamps(self.scenes[scene])
+        Ok(self.kept(self.source.timestamps(self.scenes[scene])?))
     }
 
     fn url(&self, scene: usize) -> Result<String, DataError> {
@@ -61,18 +85,41 @@ impl SceneSource for SceneSubset {
     }
 
     fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
-        self.source.frame_names(self.scenes[scene])
+        Ok(self.kept(self.source.frame_names(self.scenes[scene])?))
     }
 
     fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
-        self.source.image_size(self.scenes[scene], frame)
+        self.source.image_size(self.scenes[scene], self.frame_in_source(frame))
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        self.source.frame(self.scenes[scene], frame)
+        self.source.frame(self.scenes[scene], self.frame_in_source(frame))
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
-        self.source.encoded_frame(self.scenes[scene], frame)
+        self.source.encoded_frame(self.scenes[scene], self.frame_in_source(frame))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::rooms;
+
+    #[test]
+    fn training_has_all_frames_but_the_held_out() {
+        for (every, num_frames) in [(2, 7), (3, 9), (8, 16), (8, 17), (8, 3)] {
+            let whole = Arc::new(rooms(|c| c.num_frames = num_frames));
+            let training = SceneSubset::without_held_out(whole.clone(), every);
+            let expected: Vec<usize> = (0..num_frames).filter(|frame| frame % every != 0).collect();
+            assert_eq!(training.num_frames(0).unwrap(), expected.len());
+            let cameras = whole.cameras(0).unwrap();
+            assert_eq!(training.cameras(0).unwrap(), expected.iter().map(|&i| cameras[i]).collect::<Vec<_>>());
+            for (frame, &in_source) in expected.iter().enumerate() {
+                assert_eq!(training.frame_in_source(frame), in_source);
+                assert_eq!(training.frame(0, frame).unwrap(), whole.frame(0, in_source).unwrap());
+            }
+        }
+        assert!(!is_held_out(0, 0) && is_held_out(0, 8) && is_held_out(16, 8) && !is_held_out(15, 8));
     }
 }

@@ -158,6 +158,7 @@ mod tests {
     use super::*;
     use crate::image::codec::decode_image;
     use crate::synthetic::config::MAX_SCENES;
+    use crate::testing::rooms as source;
     use std::collections::BTreeSet;
     use std::path::Path;
 
@@ -168,38 +169,28 @@ mod tests {
         })
     }
 
-    fn source(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
-        let mut config = SyntheticConfig::default();
-        change(&mut config);
-        SyntheticSource::new(config).unwrap()
-    }
-
     #[test]
     fn frames_depend_on_seed_and_position_alone() {
-        let first = source(|_| ()).frame(7, 3).unwrap();
-        let second = source(|c| c.num_scenes = 8).frame(7, 3).unwrap();
-        assert_eq!(first, second);
-        assert_eq!((first.width, first.height, first.rgb.len()), (32, 32, 32 * 32 * 3));
-        for other in [source(|_| ()).frame(7, 4), source(|_| ()).frame(8, 3), source(|c| c.seed = 1).frame(7, 3)] {
-            assert_ne!(first, other.unwrap());
+        for look in [Look::Rooms, Look::Real] {
+            let of = |seed, num_scenes| source(|c| (c.look, c.seed, c.num_scenes) = (look, seed, num_scenes));
+            let (source, again) = (of(0, 8), of(0, 100));
+            let first = source.frame(7, 3).unwrap();
+            assert_eq!((first.width, first.height, first.rgb.len()), (32, 32, 32 * 32 * 3));
+            // More scenes than are kept lie between the two reads.
+            for scene in (0..2 * KEPT_SCENES).rev() {
+                again.cameras(scene).unwrap();
+            }
+            assert_eq!([again.frame(7, 3).unwrap(), again.frame(7, 3).unwrap()], [first.clone(), first.clone()]);
+            assert_eq!(again.kept.lock().unwrap().len(), KEPT_SCENES);
+            for other in [source.frame(7, 4), again.frame(8, 3), of(1, 8).frame(7, 3)] {
+                assert_ne!(first, other.unwrap());
+            }
         }
     }
 
     #[test]
-    fn real_frames_depend_on_seed_and_position_alone() {
-        let first = real(|_| ()).frame(7, 3).unwrap();
-        // More scenes than are kept lie between the two reads.
-        let again = real(|c| c.num_scenes = 100);
-        for scene in (0..2 * KEPT_SCENES).rev() {
-            again.cameras(scene).unwrap();
-        }
-        assert_eq!(first, again.frame(7, 3).unwrap());
-        assert_eq!(first, again.frame(7, 3).unwrap());
-        assert_eq!(again.kept.lock().unwrap().len(), KEPT_SCENES);
-        for other in [real(|_| ()).frame(7, 4), real(|_| ()).frame(8, 3), real(|c| c.seed = 1).frame(7, 3)] {
-            assert_ne!(first, other.unwrap());
-        }
-        // Any size, odd ones too; the view is the same.
+    fn real_scenes_have_any_size() {
+        // Odd sizes too; the view is the same.
         let wide = real(|c| (c.width, c.height) = (35, 21));
         assert_eq!(wide.frame(7, 3).unwrap().rgb.len(), 35 * 21 * 3);
         let (camera, square) = (wide.cameras(7).unwrap()[3], real(|_| ()).cameras(7).unwrap()[3]);

@@ -306,7 +306,7 @@ impl<'a> Converter<'a> {
         self.flush()?;
         let names: Vec<&String> = self.unreadable.iter().collect();
         let skipped = &mut self.report.skipped;
-        skipped.notes.extend(note_on(&names, "scene", "unreadable now, kept as converted before"));
+        skipped.notes.extend(note_on(&names, "unreadable now, kept as converted before"));
         skipped.skips.retain(|skip| !self.unreadable.contains(&skip.key));
         let is_chunks = self.options.to != ConvertTo::Scenes;
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));

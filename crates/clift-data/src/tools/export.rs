@@ -74,7 +74,10 @@ pub fn write_source(
 
 /// Reads a scene, its frames on all cores. Image files are copied; other frames, and images with a side above `max_size`
 /// pixels after their reduction, are encoded. Returns the scene and the number of encoded frames.
-pub(crate) fn read_scene(
+///
+/// # Errors
+/// The errors of reading and encoding.
+pub fn read_scene(
     source: &dyn SceneSource,
     scene: usize,
     encoding: ImageEncoding,
@@ -149,16 +152,13 @@ mod tests {
     use crate::scene_source::Split;
     use crate::sources::chunks::chunk_source::ChunkSource;
     use crate::sources::filters::SceneFilters;
-    use crate::synthetic::config::SyntheticConfig;
-    use crate::synthetic::source::SyntheticSource;
-    use crate::testing::assert_same;
+    use crate::testing::{assert_same, rooms};
 
     #[test]
     fn written_scenes_equal_those_of_the_source() {
         let root = tempfile::tempdir().unwrap();
         for split in [Split::Train, Split::Test] {
-            let size = SyntheticConfig { num_scenes: 5, num_frames: 6, width: 40, height: 24, ..Default::default() };
-            let source = SyntheticSource::new(SyntheticConfig { seed: 5, split, ..size }).unwrap();
+            let source = rooms(|c| (c.split, c.num_scenes, c.num_frames, c.width, c.height) = (split, 5, 6, 40, 24));
             // About two scenes to a chunk.
             let folder = root.path().join(split.to_string());
             let written = write_source(&source, &folder, ImageEncoding::Png, 25_000, |_| ()).unwrap();
@@ -172,8 +172,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("evaluation_index.json");
         for (num_frames, expected) in [(16, 3), (6, 0)] {
-            let config = SyntheticConfig { num_scenes: 3, num_frames, ..Default::default() };
-            let source = SyntheticSource::new(config).unwrap();
+            let source = rooms(|c| (c.num_scenes, c.num_frames) = (3, num_frames));
             assert_eq!(write_evaluation_index(&path, &source, 4, 3).unwrap(), expected);
             let (items, report) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
             assert_eq!((items.len(), report.num_scenes), (expected, 3));

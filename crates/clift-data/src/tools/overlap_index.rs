@@ -142,7 +142,7 @@ pub fn write_overlap_index(
         }
         shared.push(key);
     }
-    let notes = note_on(&shared, "scene", "in both splits, counted once").into_iter().collect();
+    let notes = note_on(&shared, "in both splits, counted once").into_iter().collect();
     let sample = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.sample_views(source.key(*scene), &cameras)
@@ -167,14 +167,12 @@ mod tests {
     use crate::geometry::camera::IntrinsicsNorm;
     use crate::geometry::pose::Pose;
     use crate::sampling::evaluation_index::EvaluationIndex;
-    use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
-    use crate::testing::TestSource;
+    use crate::testing::{self, TestSource};
     use glam::DMat3;
 
-    fn rooms(num_frames: usize, path_length: f64) -> SyntheticSource {
-        let config = SyntheticConfig { num_scenes: 20, num_frames, path_length, ..Default::default() };
-        SyntheticSource::new(config).unwrap()
+    fn rooms(num_scenes: usize) -> SyntheticSource {
+        testing::rooms(|c| (c.num_scenes, c.num_frames, c.path_length) = (num_scenes, 60, 3.0))
     }
 
     fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, SkipReport) {
@@ -186,7 +184,7 @@ mod tests {
 
     #[test]
     fn every_pair_overlaps_at_an_allowed_distance() {
-        let source = rooms(60, 3.0);
+        let source = rooms(20);
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
         let (written, report) = index(&source, &options);
         let (items, _) = written.select(&source, 0);
@@ -214,10 +212,11 @@ mod tests {
     fn scenes_without_views_are_null_and_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
-        let report = write_overlap_index(&path, &[&rooms(40, 3.0)], &OverlapOptions::default()).unwrap();
+        let short = testing::rooms(|c| (c.num_scenes, c.num_frames) = (20, 40));
+        let report = write_overlap_index(&path, &[&short], &OverlapOptions::default()).unwrap();
         assert_eq!(report.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
         assert!(!path.exists(), "an index without views");
-        let (written, report) = index(&first_is_short(rooms(60, 3.0)), &OverlapOptions::default());
+        let (written, report) = index(&first_is_short(rooms(20)), &OverlapOptions::default());
         assert_eq!((written.num_keys(), written.usable().count()), (20, 19));
         assert_eq!(report.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
     }
@@ -253,12 +252,11 @@ mod tests {
         let views = |source: &SyntheticSource, options: &OverlapOptions| {
             index(source, options).0.usable().map(|(key, views)| (key.to_owned(), views.clone())).collect::<Vec<_>>()
         };
-        let all = views(&rooms(60, 3.0), &options);
-        assert_eq!(all, views(&rooms(60, 3.0), &options));
-        let fewer = SyntheticConfig { num_scenes: 5, num_frames: 60, path_length: 3.0, ..Default::default() };
-        let fewer = views(&SyntheticSource::new(fewer).unwrap(), &options);
+        let all = views(&rooms(20), &options);
+        assert_eq!(all, views(&rooms(20), &options));
+        let fewer = views(&rooms(5), &options);
         assert_eq!(fewer[..], all[..fewer.len()]);
-        assert_ne!(all, views(&rooms(60, 3.0), &OverlapOptions { seed: 5, ..options }));
+        assert_ne!(all, views(&rooms(20), &OverlapOptions { seed: 5, ..options }));
     }
 
     #[test]
@@ -266,9 +264,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let other = SyntheticConfig { num_scenes: 3, num_frames: 60, seed: 1, path_length: 3.0, ..Default::default() };
-        let other = SyntheticSource::new(other).unwrap();
-        let report = write_overlap_index(&path, &[&rooms(60, 3.0), &other], &options).unwrap();
+        let other = testing::rooms(|c| (c.seed, c.num_scenes, c.num_frames, c.path_length) = (1, 3, 60, 3.0));
+        let report = write_overlap_index(&path, &[&rooms(20), &other], &options).unwrap();
         let written = EvaluationIndex::read(&path).unwrap();
         assert_eq!((report.num_scenes, written.num_keys()), (23, 23));
         let alone = index(&other, &options).0;
@@ -280,9 +277,8 @@ mod tests {
         assert_eq!(report.num_scenes, 3);
         let keys = [0, 1, 2].map(|scene| other.key(scene)).join(", ");
         assert_eq!(report.notes, [format!("3 scenes in both splits, counted once ({keys})")]);
-        let rooms = rooms(60, 3.0);
-        let shorter = first_is_short(self::rooms(60, 3.0));
-        let message = write_overlap_index(&path, &[&rooms, &shorter], &options).unwrap_err().to_string();
+        let shorter = first_is_short(rooms(20));
+        let message = write_overlap_index(&path, &[&rooms(20), &shorter], &options).unwrap_err().to_string();
         assert!(message.contains("is in both splits with different cameras; make one index per split"), "{message}");
     }
 
@@ -291,9 +287,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let whole = rooms(60, 3.0);
-        let broken = TestSource::new(rooms(60, 3.0))
-            .with_cameras(|scene, _| Err(DataError::NoSuchScene { scene, num_scenes: 0 }));
+        let whole = rooms(20);
+        let broken =
+            TestSource::new(rooms(20)).with_cameras(|scene, _| Err(DataError::NoSuchScene { scene, num_scenes: 0 }));
         let num_used = index(&whole, &options).1.num_used();
         let orders: [[&dyn SceneSource; 2]; 2] = [[&whole, &broken], [&broken, &whole]];
         for sources in orders {

@@ -19,19 +19,26 @@ pub fn count(count: usize) -> String {
     grouped(count as f64, 0)
 }
 
-/// Returns the head of a table. A line break in a name starts a second line.
-pub fn head(names: &[&str]) -> Markup {
+/// Returns a table that scrolls within the page. A line break in a name of the head starts a second line.
+pub fn table(class: Option<&str>, head: &[&str], rows: &Markup) -> Markup {
     html! {
-        thead {
-            tr {
-                @for name in names {
-                    th scope="col" {
-                        @for (i, line) in name.lines().enumerate() {
-                            @if i > 0 { br; }
-                            (line)
+        div.scroll {
+            table class=[class] {
+                @if !head.is_empty() {
+                    thead {
+                        tr {
+                            @for name in head {
+                                th scope="col" {
+                                    @for (i, line) in name.lines().enumerate() {
+                                        @if i > 0 { br; }
+                                        (line)
+                                    }
+                                }
+                            }
                         }
                     }
                 }
+                tbody { (rows) }
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use maud::{Markup, html};
 
-use crate::report::html::{head, number};
+use crate::report::html::{number, table};
 use crate::report::plot::{Look, Mark, Plot, Series};
 use crate::statistics::scene_scores::{SceneScore, SceneScores};
 use crate::sweep::rendered_views::spread;
@@ -21,6 +21,18 @@ pub fn section(scores: &SceneScores) -> Markup {
     let (Some(key), 2..) = (scores.key, scores.scenes.len()) else { return Markup::default() };
     let count = scores.scenes.len();
     let listed = (0..count).filter(|rank| *rank < MAX_LISTED || rank + MAX_LISTED >= count);
+    let rows = html! {
+        @for rank in listed {
+            @let SceneScore { scene, psnr, nearest_psnr } = &scores.scenes[rank];
+            tr.first[rank == count.saturating_sub(MAX_LISTED) && rank > MAX_LISTED] {
+                td { (rank + 1) }
+                td { (shortened(scene)) }
+                td { (number(Some(*psnr), 2)) }
+                td { (number(*nearest_psnr, 2)) }
+                td { (number(nearest_psnr.map(|nearest| psnr - nearest), 2)) }
+            }
+        }
+    };
     html! {
         h2 { "Scene by scene" }
         p.note {
@@ -29,25 +41,7 @@ pub fn section(scores: &SceneScores) -> Markup {
         }
         div.figures {
             section { (plot(&scores.scenes).to_html()) }
-            section {
-                div.scroll {
-                    table {
-                        (head(&HEAD))
-                        tbody {
-                            @for rank in listed {
-                                @let SceneScore { scene, psnr, nearest_psnr } = &scores.scenes[rank];
-                                tr.first[rank == count.saturating_sub(MAX_LISTED) && rank > MAX_LISTED] {
-                                    td { (rank + 1) }
-                                    td { (shortened(scene)) }
-                                    td { (number(Some(*psnr), 2)) }
-                                    td { (number(*nearest_psnr, 2)) }
-                                    td { (number(nearest_psnr.map(|nearest| psnr - nearest), 2)) }
-                                }
-                            }
-                        }
-                    }
-                }
-            }
+            section { (table(None, &HEAD, &rows)) }
         }
     }
 }

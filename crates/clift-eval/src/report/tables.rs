@@ -5,7 +5,7 @@ use clift_model::TokenCoding;
 use maud::{Markup, html};
 
 use crate::report::axis::{grouped, milliseconds};
-use crate::report::html::{DASH, count, head, number};
+use crate::report::html::{DASH, count, number, table};
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::system::machine::machine_rows;
@@ -48,39 +48,35 @@ const DIFFERENCES_NOTE: &str = "PSNR of the method that the paper finds better m
 /// Returns the table of all points, baselines first, with notes on missing images and metrics.
 pub fn points(summary: &Summary) -> Markup {
     let Summary { baselines, points, missing, not_measured, num_views, .. } = summary;
-    html! {
-        h2 { "All points" }
-        div.scroll {
-            table.points {
-                (head(&POINTS_HEAD))
-                tbody {
-                    @for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
-                        tr {
-                            td {
-                                (name)
-                                @if quality.num_identical_views > 0 {
-                                    " (" (count(quality.num_identical_views)) " views identical to the target)"
-                                }
-                            }
-                            td {} td {} td {}
-                            td { (number(quality.psnr, 2)) }
-                            td {}
-                            td { (number(quality.ssim, 3)) }
-                            td { (number(quality.lpips_vgg, 3)) }
-                            @for _ in 8..POINTS_HEAD.len() { td {} }
-                        }
-                    }
-                    @for (i, point) in points.iter().enumerate() {
-                        @let is_first = i == 0 || points[i - 1].key.method != point.key.method;
-                        @let is_front = point.pareto_time || point.pareto_bytes;
-                        tr.first[is_first].front-row[is_front] {
-                            td { (point.key.method.name()) }
-                            @for cell in cells(point) { td { (cell) } }
-                        }
+    let rows = html! {
+        @for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
+            tr {
+                td {
+                    (name)
+                    @if quality.num_identical_views > 0 {
+                        " (" (count(quality.num_identical_views)) " views identical to the target)"
                     }
                 }
+                td {} td {} td {}
+                td { (number(quality.psnr, 2)) }
+                td {}
+                td { (number(quality.ssim, 3)) }
+                td { (number(quality.lpips_vgg, 3)) }
+                @for _ in 8..POINTS_HEAD.len() { td {} }
             }
         }
+        @for (i, point) in points.iter().enumerate() {
+            @let is_first = i == 0 || points[i - 1].key.method != point.key.method;
+            @let is_front = point.pareto_time || point.pareto_bytes;
+            tr.first[is_first].front-row[is_front] {
+                td { (point.key.method.name()) }
+                @for cell in cells(point) { td { (cell) } }
+            }
+        }
+    };
+    html! {
+        h2 { "All points" }
+        (table(Some("points"), &POINTS_HEAD, &rows))
         p.note { (POINTS_NOTE) }
         @for missing in missing {
             p.note {
@@ -125,48 +121,38 @@ fn cells(point: &SummaryPoint) -> [String; 18] {
 
 /// Returns the table of paired differences; nothing without pairs.
 pub fn differences(differences: &[PairedDifference]) -> Markup {
+    let rows = html! {
+        @for row in differences {
+            tr {
+                td { (row.method.name()) }
+                td { (row.against.name()) }
+                td { (count(row.num_storage_tokens)) }
+                td { (storage_name(row.tokens)) }
+                td { (count(row.num_scenes)) }
+                td { (grouped(row.psnr, 2)) }
+                td { (number(row.psnr_stderr, 2)) }
+            }
+        }
+    };
     html! {
         @if !differences.is_empty() {
             h2 { "Differences between methods" }
             p.note { (DIFFERENCES_NOTE) }
-            div.scroll {
-                table {
-                    (head(&DIFFERENCES_HEAD))
-                    tbody {
-                        @for row in differences {
-                            tr {
-                                td { (row.method.name()) }
-                                td { (row.against.name()) }
-                                td { (count(row.num_storage_tokens)) }
-                                td { (storage_name(row.tokens)) }
-                                td { (count(row.num_scenes)) }
-                                td { (grouped(row.psnr, 2)) }
-                                td { (number(row.psnr_stderr, 2)) }
-                            }
-                        }
-                    }
-                }
-            }
+            (table(None, &DIFFERENCES_HEAD, &rows))
         }
     }
 }
 
 /// Returns the number of evaluated scenes, and the reasons of the skipped scenes.
 pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
+    let rows = html! { @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } } };
     html! {
         h2 { "Skipped scenes" }
         p { (count(num_evaluated)) " of " (count(skip_report.num_scenes)) " scenes were evaluated." }
         @if skip_report.skips.is_empty() {
             p { "No scene was skipped." }
         } @else {
-            div.scroll {
-                table.plain {
-                    thead { tr { th { "scenes" } th { "reason" } } }
-                    tbody {
-                        @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } }
-                    }
-                }
-            }
+            (table(Some("plain"), &["scenes", "reason"], &rows))
             p.note { "All names: " code { "skipped.json" } "." }
         }
     }
@@ -176,17 +162,11 @@ pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
 pub fn machine(device: &str, command: &str) -> Markup {
     let version = env!("CARGO_PKG_VERSION").to_owned();
     let program = [("command", command.to_owned()), ("clift", version), ("device", device.to_owned())];
+    let rows = program.into_iter().chain(machine_rows());
+    let rows = html! { @for (name, value) in rows { tr { td { (name) } td { (value) } } } };
     html! {
         h2 { "Command and machine" }
-        div.scroll {
-            table.plain {
-                tbody {
-                    @for (name, value) in program.into_iter().chain(machine_rows()) {
-                        tr { td { (name) } td { (value) } }
-                    }
-                }
-            }
-        }
+        (table(Some("plain"), &[], &rows))
     }
 }
 

@@ -17,6 +17,7 @@ use crate::names::parse;
 use crate::network::config::ModelConfig;
 use crate::tokens::kind::TokenKind;
 use crate::weights::file::sorted_header;
+use crate::weights::tensors::Tensors;
 
 const FORMAT: &str = "clift-codec";
 const VERSION: &str = "1";
@@ -139,28 +140,16 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     model.validate().map_err(|error| error.to_string())?;
     let kind = field("kind")?;
     let kind = parse(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
-    let data = |name: &str, dtype: Dtype, shape: &[usize]| {
-        let view = file.tensor(name).map_err(|_| format!("no tensor `{name}`"))?;
-        if view.dtype() != dtype || view.shape() != shape {
-            return Err(format!("`{name}` is {:?} {:?}, expected {dtype:?} {shape:?}", view.dtype(), view.shape()));
-        }
-        Ok(view.data().to_vec())
-    };
-    let length = |name: &str| match file.tensor(name).map(|view| view.shape().to_vec()).as_deref() {
-        Ok(&[length]) => Ok(length),
-        _ => Err(format!("no tensor `{name}` of one dimension")),
-    };
-    let f32s = |name: &str, shape: &[usize]| -> Result<Vec<f32>, String> {
-        let values: Vec<f32> =
-            data(name, Dtype::F32, shape)?.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+    let file = Tensors(file);
+    let f64s = |name: &str, shape: &[usize]| file.f64s(name, shape);
+    let f32s = |name: &str, shape: &[usize]| {
+        let values = file.f32s(name, shape)?;
         match values.iter().find(|value| !value.is_finite()) {
             Some(value) => Err(format!("`{name}` contains {value}")),
             None => Ok(values),
         }
     };
-    let f64s = |name: &str, shape: &[usize]| -> Result<Vec<f64>, String> {
-        Ok(data(name, Dtype::F64, shape)?.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect())
-    };
+    let length = |name: &str| file.length(name);
     let (dim, knots, counts, steps) = (model.dim, length("knots")?, length("rate_shares")?, length("rate_steps")?);
     let transform = Transform {
         mean: f32s("mean", &[dim])?,

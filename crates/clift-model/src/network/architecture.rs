@@ -18,14 +18,6 @@ pub enum Architecture {
     LvsmEd,
 }
 
-impl Architecture {
-    /// Whether the network is `CLiFT`'s: files of such networks do not name the architecture.
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
-    pub(crate) fn is_clift(&self) -> bool {
-        *self == Self::Clift
-    }
-}
-
 /// Variant of the network: that of its paper, or one of the released code's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
@@ -81,12 +73,6 @@ pub enum CameraEncoding {
 impl CameraEncoding {
     /// All encodings, in the order of messages and help texts.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
-
-    /// Whether attention is plain: files of such networks do not name the encoding.
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
-    pub(crate) fn is_plucker(&self) -> bool {
-        *self == Self::Plucker
-    }
 }
 
 impl std::str::FromStr for CliftVariant {

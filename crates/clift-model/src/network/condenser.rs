@@ -244,7 +244,7 @@ mod tests {
             let lift = random([2, 6, 16], 1, &device).cast(DType::F32);
             let scene = SceneClusters::new(vec![0, 1, 1, 0, 0, 1], vec![3, 2]).expect("valid");
             let index = Clusters::new(vec![scene.clone(), scene]).expect("equal").upload(&device);
-            let expected = index.gather_centroids(lift.clone());
+            let expected = index.gather(lift.clone(), &index.centroid);
             assert_close(&condenser.forward(lift, &index).values, &expected, 0.0);
         }
     }

@@ -11,12 +11,12 @@ use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant};
 #[serde(from = "ModelSection")]
 pub struct ModelConfig {
     /// Kind of the network.
-    #[serde(skip_serializing_if = "Architecture::is_clift")]
+    #[serde(skip_serializing_if = "is_default")]
     pub architecture: Architecture,
     /// Variant of the network.
     pub variant: CliftVariant,
     /// Latents of LVSM, the tokens of a scene; 0 in `CLiFT`, which has a token per patch.
-    #[serde(skip_serializing_if = "is_zero")]
+    #[serde(skip_serializing_if = "is_default")]
     pub num_latents: usize,
     /// Width of a token.
     pub dim: usize,
@@ -31,7 +31,7 @@ pub struct ModelConfig {
     /// Side of a patch in pixels; every patch is one token.
     pub patch_size: usize,
     /// How attention knows the cameras.
-    #[serde(skip_serializing_if = "CameraEncoding::is_plucker")]
+    #[serde(skip_serializing_if = "is_default")]
     pub camera_encoding: CameraEncoding,
     /// The condenser of stage 2.
     pub condenser: CondenserConfig,
@@ -53,9 +53,9 @@ impl Default for ModelConfig {
     }
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
-fn is_zero(count: &usize) -> bool {
-    *count == 0
+/// Whether files do not name the value.
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl CondenserConfig {
@@ -69,7 +69,7 @@ impl CondenserConfig {
 }
 
 /// [`ModelConfig`] in a file. Defaults of sizes depend on architecture and variant.
-#[derive(Deserialize)]
+#[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct ModelSection {
     architecture: Architecture,
@@ -78,9 +78,9 @@ struct ModelSection {
     dim: Option<usize>,
     num_heads: Option<usize>,
     feed_forward_dim: Option<usize>,
-    num_encoder_blocks: usize,
-    num_renderer_blocks: usize,
-    patch_size: usize,
+    num_encoder_blocks: Option<usize>,
+    num_renderer_blocks: Option<usize>,
+    patch_size: Option<usize>,
     camera_encoding: CameraEncoding,
     condenser: CondenserSection,
 }
@@ -91,24 +91,6 @@ struct ModelSection {
 struct CondenserSection {
     num_blocks: Option<usize>,
     residual: Option<bool>,
-}
-
-impl Default for ModelSection {
-    fn default() -> Self {
-        Self {
-            architecture: Architecture::Clift,
-            variant: CliftVariant::Paper,
-            num_latents: None,
-            dim: None,
-            num_heads: None,
-            feed_forward_dim: None,
-            num_encoder_blocks: 6,
-            num_renderer_blocks: 6,
-            patch_size: 8,
-            camera_encoding: CameraEncoding::Plucker,
-            condenser: CondenserSection::default(),
-        }
-    }
 }
 
 impl From<ModelSection> for ModelConfig {
@@ -127,9 +109,9 @@ impl From<ModelSection> for ModelConfig {
             dim: section.dim.unwrap_or(dim),
             num_heads: section.num_heads.unwrap_or(num_heads),
             feed_forward_dim: section.feed_forward_dim.unwrap_or(feed_forward_dim),
-            num_encoder_blocks: section.num_encoder_blocks,
-            num_renderer_blocks: section.num_renderer_blocks,
-            patch_size: section.patch_size,
+            num_encoder_blocks: section.num_encoder_blocks.unwrap_or(6),
+            num_renderer_blocks: section.num_renderer_blocks.unwrap_or(6),
+            patch_size: section.patch_size.unwrap_or(8),
             camera_encoding: section.camera_encoding,
             condenser: CondenserConfig {
                 num_blocks: section.condenser.num_blocks.unwrap_or(defaults.num_blocks),

@@ -54,30 +54,21 @@ impl Init {
 
     /// Makes a linear layer with bias, both uniform in `+-1/sqrt(inputs)`.
     pub fn linear(&mut self, inputs: usize, outputs: usize) -> Linear {
-        if let Some(deviation) = self.deviation {
-            return self.normal_linear(inputs, outputs, deviation);
-        }
         let bound = 1.0 / (inputs as f64).sqrt();
-        Linear { weight: self.uniform([inputs, outputs], bound), bias: Some(self.uniform([outputs], bound)) }
+        let mut layer = self.matrix(inputs, outputs, bound);
+        layer.bias = layer.bias.map(|_| self.uniform([outputs], bound));
+        layer
     }
 
     /// Makes a packed attention projection of `parts` matrices `[dim, dim]`: Xavier-uniform for the whole `[dim, 3 dim]`
     /// matrix of queries, keys and values, with zero bias.
     pub fn attention_in(&mut self, dim: usize, parts: usize) -> Linear {
-        if let Some(deviation) = self.deviation {
-            return self.normal_linear(dim, parts * dim, deviation);
-        }
-        let bound = (6.0 / (4 * dim) as f64).sqrt();
-        Linear { weight: self.uniform([dim, parts * dim], bound), bias: Some(self.zeros([parts * dim])) }
+        self.matrix(dim, parts * dim, (6.0 / (4 * dim) as f64).sqrt())
     }
 
     /// Makes the projection after attention: uniform weight, zero bias.
     pub fn attention_out(&mut self, dim: usize) -> Linear {
-        if let Some(deviation) = self.deviation {
-            return self.normal_linear(dim, dim, deviation);
-        }
-        let bound = 1.0 / (dim as f64).sqrt();
-        Linear { weight: self.uniform([dim, dim], bound), bias: Some(self.zeros([dim])) }
+        self.matrix(dim, dim, 1.0 / (dim as f64).sqrt())
     }
 
     /// Makes a linear layer of zeros without bias (`W_z` of equation 4).
@@ -100,7 +91,11 @@ impl Init {
         LayerNormConfig::new(dim).with_bias(self.deviation.is_none()).init(&self.device)
     }
 
-    fn normal_linear(&mut self, inputs: usize, outputs: usize, deviation: f64) -> Linear {
+    /// Makes a linear layer, uniform in `+-bound` with zero bias, or normal without bias.
+    fn matrix(&mut self, inputs: usize, outputs: usize, bound: f64) -> Linear {
+        let Some(deviation) = self.deviation else {
+            return Linear { weight: self.uniform([inputs, outputs], bound), bias: Some(self.zeros([outputs])) };
+        };
         let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * self.normal()) as f32).collect();
         let weight = Tensor::from_data(TensorData::new(values, [inputs, outputs]), &self.device);
         Linear { weight: Param::from_tensor(weight), bias: None }

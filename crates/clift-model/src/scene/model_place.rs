@@ -2,6 +2,7 @@
 
 use std::path::{Component, Path, PathBuf};
 
+use crate::files::folder_of;
 use crate::scene::scene::Scene;
 
 impl Scene {
@@ -9,7 +10,7 @@ impl Scene {
     /// both can be moved together and read from any folder; an absolute `model` as it is.
     pub fn model_path_for(model: &Path, file: &Path) -> String {
         let relative = || {
-            let from = folder(file).canonicalize().ok()?;
+            let from = folder_of(file).canonicalize().ok()?;
             let to = model.canonicalize().ok()?;
             let shared = from.components().zip(to.components()).take_while(|(a, b)| a == b).count();
             let up = from.components().skip(shared).map(|_| Component::ParentDir);
@@ -28,11 +29,7 @@ impl Scene {
 }
 
 pub(crate) fn find_model(model_path: &str, file: &Path) -> PathBuf {
-    let beside = folder(file).join(model_path);
+    let beside = folder_of(file).join(model_path);
     let here = PathBuf::from(model_path);
     if !beside.exists() && here.exists() { here } else { beside }
-}
-
-fn folder(file: &Path) -> &Path {
-    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use safetensors::{Dtype, SafeTensorError, SafeTensors};
+use safetensors::{SafeTensorError, SafeTensors};
 
 use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
@@ -16,6 +16,7 @@ use crate::scene::token_coding::{CodedLoss, TokenCoding};
 use crate::scene::token_format::TokenFormat;
 use crate::views::camera::ViewCamera;
 use crate::weights::model_path::ModelPath;
+use crate::weights::tensors::Tensors;
 
 /// Longest accepted header; headers of version 2 have 2048 bytes.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
@@ -163,44 +164,7 @@ fn check_rays(scene: &Scene, rays: &[f32]) -> Result<(), String> {
     Ok(())
 }
 
-/// The tensors of a file, looked up by name, type and shape.
-struct Tensors<'a>(SafeTensors<'a>);
-
 impl Tensors<'_> {
-    fn view(&self, name: &str) -> Result<safetensors::tensor::TensorView<'_>, String> {
-        self.0.tensor(name).map_err(|_| format!("no tensor `{name}`"))
-    }
-
-    fn length(&self, name: &str) -> Result<usize, String> {
-        match self.view(name)?.shape() {
-            &[length] => Ok(length),
-            shape => Err(format!("`{name}` has the shape {shape:?}, expected one dimension")),
-        }
-    }
-
-    fn data(&self, name: &str, dtype: Dtype, shape: &[usize]) -> Result<Vec<u8>, String> {
-        let view = self.view(name)?;
-        if view.dtype() != dtype || view.shape() != shape {
-            return Err(format!("`{name}` is {:?} {:?}, expected {dtype:?} {shape:?}", view.dtype(), view.shape()));
-        }
-        Ok(view.data().to_vec())
-    }
-
-    fn f64s(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>, String> {
-        let data = self.data(name, Dtype::F64, shape)?;
-        Ok(data.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect())
-    }
-
-    fn f32s(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, String> {
-        let data = self.data(name, Dtype::F32, shape)?;
-        Ok(data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
-    }
-
-    fn u32s(&self, name: &str, shape: &[usize]) -> Result<Vec<u32>, String> {
-        let data = self.data(name, Dtype::U32, shape)?;
-        Ok(data.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect())
-    }
-
     fn tokens(&self, model: &ModelConfig) -> Result<(TokenFormat, usize, Vec<f32>), String> {
         let dim = model.dim;
         let dtype = self.view("tokens")?.dtype();

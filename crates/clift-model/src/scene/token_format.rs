@@ -1,14 +1,11 @@
 //! Number formats of the tokens in a scene file.
 // S storage tokens, D width
 
-use std::str::FromStr;
-
 use half::f16;
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
-use crate::names::parse_value;
 
 /// Largest magnitude of an 8-bit value; -128 is not used, so that the range is symmetric.
 const INT8_MAX: f32 = 127.0;
@@ -94,14 +91,6 @@ impl TokenFormat {
                 tokens.flat_map(|(token, scale)| token.iter().map(move |&byte| f32::from(byte as i8) * scale)).collect()
             }
         }
-    }
-}
-
-impl FromStr for TokenFormat {
-    type Err = ModelError;
-
-    fn from_str(name: &str) -> Result<Self, ModelError> {
-        parse_value("tokens", name)
     }
 }
 

@@ -152,15 +152,6 @@ pub(crate) struct Members {
 }
 
 impl ClusterIndex {
-    /// Selects the rows of the centroids.
-    ///
-    /// # Shapes
-    /// - `tokens`: `[batch, num_tokens, dim]`
-    /// - returns `[batch, num_storage_tokens, dim]`
-    pub fn gather_centroids(&self, tokens: Tensor<3>) -> Tensor<3> {
-        self.gather(tokens, &self.centroid)
-    }
-
     /// Selects rows `index` of the tokens of all scenes: `[B, N, D] -> [B, rows / B, D]`.
     pub(crate) fn gather(&self, tokens: Tensor<3>, index: &Tensor<1, Int>) -> Tensor<3> {
         let [batch, num_tokens, dim] = tokens.dims();
@@ -201,7 +192,7 @@ mod tests {
         .expect("equal counts");
         let index = clusters.upload(&device);
         let tokens = Tensor::<1, Int>::arange(0..6, &device).float().reshape([2, 3, 1]);
-        assert_eq!(to_vec(index.gather_centroids(tokens)), [2.0, 1.0, 4.0, 3.0]);
+        assert_eq!(to_vec(index.gather(tokens, &index.centroid)), [2.0, 1.0, 4.0, 3.0]);
         let members = index.members.expect("one per scene");
         assert_eq!(members.token.into_data().convert::<i64>().try_to_vec::<i64>().expect("ints"), [0, 5]);
         assert_eq!(members.segment.into_data().convert::<i64>().try_to_vec::<i64>().expect("ints"), [0, 3]);

@@ -4,6 +4,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
+use crate::network::architecture::CameraEncoding;
 use crate::network::config::ModelConfig;
 use crate::network::renderer::Renderer;
 
@@ -26,7 +27,8 @@ pub fn weights_hash<M: Module>(module: &M) -> String {
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, camera_encoding, .. } = config;
     // Renderers of former versions keep their hashes.
-    let encoding = if camera_encoding.is_plucker() { String::new() } else { format!("{camera_encoding} ") };
+    let is_plain = *camera_encoding == CameraEncoding::Plucker;
+    let encoding = if is_plain { String::new() } else { format!("{camera_encoding} ") };
     hex::encode(Sha256::digest(format!("{variant} {num_heads} {encoding}{}", weights_hash(renderer))))
 }
 

@@ -87,13 +87,4 @@ mod tests {
         assert_eq!(launched(&[step, mpirun].concat()), [5, 8], "mpirun inside a job step");
         assert_eq!(launched(&[("SLURM_PROCID", "0"), ("SLURM_NTASKS", "4")]), [0, 1], "a batch script is no job step");
     }
-
-    #[cfg(not(feature = "mpi"))]
-    #[test]
-    fn several_ranks_without_mpi_are_told_how_to_build() {
-        let Err(error) = (Launched { rank: 0, num_ranks: 4 }).connect() else { panic!("no MPI is there") };
-        let message = error.to_string();
-        assert!(message.starts_with("a launcher started 4 processes, and this build has no MPI: "), "{message}");
-        assert!(message.contains("--features mpi"), "{message}");
-    }
 }

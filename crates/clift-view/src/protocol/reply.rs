@@ -87,12 +87,6 @@ pub struct Comparison {
     pub psnr: f64,
 }
 
-/// A request that failed.
-#[derive(Debug, Serialize)]
-pub struct Failure {
-    pub message: String,
-}
-
 /// A header by its type.
 #[derive(Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
@@ -101,7 +95,10 @@ pub enum Reply<'a> {
     Scene(Box<OpenedScene<'a>>),
     Frame(Frame),
     Comparison(Comparison),
-    Failure(Failure),
+    /// A request that failed.
+    Failure {
+        message: String,
+    },
 }
 
 impl Reply<'_> {
@@ -129,7 +126,7 @@ mod tests {
 
     #[test]
     fn message_is_header_and_parts() {
-        let bytes = Reply::Failure(Failure { message: "no".into() }).to_bytes(&[b"ab", b"", b"c"]);
+        let bytes = Reply::Failure { message: "no".into() }.to_bytes(&[b"ab", b"", b"c"]);
         let (length, rest) = bytes.split_first_chunk::<4>().unwrap();
         let (header, parts) = rest.split_at(u32::from_le_bytes(*length) as usize);
         let header: serde_json::Value = serde_json::from_slice(header).unwrap();

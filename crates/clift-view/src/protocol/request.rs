@@ -1,7 +1,5 @@
 //! Messages of the page: JSON text, checked before they reach the render thread.
 
-use std::str::FromStr;
-
 use clift_data::{Intrinsics, IntrinsicsNorm, MAX_COORDINATE, Pose};
 use clift_model::{Precision, SelectionPreset, ViewCamera};
 use serde::de::{Deserialize, Deserializer, Error};
@@ -13,7 +11,7 @@ const FOCAL_RANGE: [f64; 2] = [1e-3, 1e3];
 
 /// A message of the page.
 #[derive(Clone, Debug, PartialEq, serde::Deserialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
     /// Opens a scene.
     Open(OpenRequest),
@@ -22,7 +20,10 @@ pub enum Request {
     /// Compares a true frame with its rendering.
     Compare(CompareRequest),
     /// Acknowledges a rendered frame.
-    Ack(AckRequest),
+    Ack {
+        /// `seq` of the received frame.
+        seq: u64,
+    },
 }
 
 /// Position of a scene in the list, and its number of stored tokens.
@@ -47,7 +48,6 @@ pub struct ViewRequest {
     pub intrinsics: IntrinsicsNorm,
     /// Rendered tokens, at most all stored tokens are used.
     pub tokens: usize,
-    #[serde(deserialize_with = "parsed")]
     pub selection: SelectionPreset,
     pub precision: Precision,
     /// Position in the list of sizes.
@@ -67,18 +67,10 @@ pub struct CompareRequest {
     /// Position in the list of true frames.
     pub frame: usize,
     pub tokens: usize,
-    #[serde(deserialize_with = "parsed")]
     pub selection: SelectionPreset,
     pub precision: Precision,
     /// Whether the reply holds the true image.
     pub image: bool,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct AckRequest {
-    /// `seq` of the received frame.
-    pub seq: u64,
 }
 
 impl ViewRequest {
@@ -104,10 +96,6 @@ fn intrinsics_of_numbers<'de, D: Deserializer<'de>>(deserializer: D) -> Result<I
     let [least, most] = FOCAL_RANGE;
     let is_valid = [fx, fy].iter().all(|f| (least..=most).contains(f)) && [cx, cy].iter().all(|c| c.abs() <= most);
     if is_valid { Ok(IntrinsicsNorm { fx, fy, cx, cy }) } else { Err(D::Error::custom("intrinsics out of range")) }
-}
-
-fn parsed<'de, D: Deserializer<'de>, T: FromStr<Err: std::fmt::Display>>(deserializer: D) -> Result<T, D::Error> {
-    String::deserialize(deserializer)?.parse().map_err(D::Error::custom)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem};
-use clift_eval::{EncodeOptions, EncodedScene, encode};
+use clift_eval::{EncodeOptions, EncodedScene, encode, file_name};
 use clift_model::{DeviceName, Renderer, Scene, TokenCoding, TokenCount, TokenFormat, TrainedModel};
 
 use crate::error::ViewError;
@@ -125,9 +125,7 @@ impl RunScenes {
         let EncodedScene { mut scene, clusters, .. } = encode(&self.model, &self.reader, *index, &options)?;
         scene.tokens = RUN_FORMAT.round(&scene.tokens, scene.model.dim)?;
         // The key comes from data: as a file name it must not lead to another folder.
-        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
-        let file: String = scene.key.chars().map(|c| if is_plain(c) { c } else { '_' }).take(80).collect();
-        let file = format!("{file}.clift");
+        let file = format!("{}.clift", file_name(&scene.key));
         let frames = views.context.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
         let stored = stored.to_string();
         let scene_args = [

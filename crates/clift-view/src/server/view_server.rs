@@ -1,6 +1,6 @@
 //! The port, the connections and the two threads: the caller's renders, a second one serves.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
+use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -35,21 +35,6 @@ const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 const MAX_HEAD_BYTES: usize = 16 << 10;
 const SOCKET_PATH: &str = "/socket";
 
-/// Where a server listens.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ServerOptions {
-    /// Address to listen on.
-    pub listen: IpAddr,
-    /// Port; 0 for any free port.
-    pub port: u16,
-}
-
-impl Default for ServerOptions {
-    fn default() -> Self {
-        Self { listen: Ipv4Addr::LOCALHOST.into(), port: 0 }
-    }
-}
-
 /// A server with its port and token.
 #[derive(Debug)]
 pub struct ViewServer {
@@ -66,12 +51,11 @@ struct Shared {
 }
 
 impl ViewServer {
-    /// Takes the port.
+    /// Takes the port of the address; 0 takes a free port.
     ///
     /// # Errors
     /// [`ViewError::Bind`] for a port in use or an address of another machine.
-    pub fn bind(options: &ServerOptions) -> Result<Self, ViewError> {
-        let address = SocketAddr::new(options.listen, options.port);
+    pub fn bind(address: SocketAddr) -> Result<Self, ViewError> {
         let bind = || {
             let listener = TcpListener::bind(address)?;
             listener.set_nonblocking(true)?;

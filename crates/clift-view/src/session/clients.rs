@@ -150,7 +150,7 @@ impl Clients {
             }
             Request::View(view) => client.view = Some(view),
             Request::Compare(compare) => client.compare = Some(compare),
-            Request::Ack(ack) => client.acknowledge(ack.seq),
+            Request::Ack { seq } => client.acknowledge(seq),
         }
         if client.is_ready() {
             self.changed.notify_one();
@@ -229,7 +229,6 @@ impl Client {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::protocol::request::AckRequest;
 
     fn view(seq: u64) -> Request {
         let text = format!(
@@ -265,9 +264,9 @@ mod tests {
         assert_eq!(render(&clients, 0.01), (id, 8));
         clients.post(id, view(9));
         assert!(is_idle(&clients), "two frames are in flight");
-        clients.post(id, Request::Ack(AckRequest { seq: 77 }));
+        clients.post(id, Request::Ack { seq: 77 });
         assert!(is_idle(&clients), "no such frame");
-        clients.post(id, Request::Ack(AckRequest { seq: 4 }));
+        clients.post(id, Request::Ack { seq: 4 });
         assert_eq!(render(&clients, 0.01), (id, 9));
         assert!((0..3).all(|_| messages.try_recv().is_ok()) && messages.try_recv().is_err());
     }
@@ -294,7 +293,7 @@ mod tests {
         // The first tab worked alone for a while, which must not cost it anything later.
         clients.post(slow, view(0));
         render(&clients, 5.0);
-        clients.post(slow, Request::Ack(AckRequest { seq: 0 }));
+        clients.post(slow, Request::Ack { seq: 0 });
         let (fast, mut b) = clients.add().unwrap();
         let cost = |id| if id == slow { 0.03 } else { 0.01 };
         for seq in 0..400 {

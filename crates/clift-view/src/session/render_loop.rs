@@ -10,7 +10,7 @@ use clift_eval::{Canvas, psnr};
 use clift_model::{DeviceName, SceneRenderer, SelectionPreset};
 
 use crate::error::ViewError;
-use crate::protocol::reply::{Comparison, Failure, Frame, Reply};
+use crate::protocol::reply::{Comparison, Frame, Reply};
 use crate::protocol::request::{CompareRequest, OpenRequest, ViewRequest};
 use crate::scenes::open_scene::{OpenScene, png, scene_camera};
 use crate::scenes::scene_set::SceneSet;
@@ -62,8 +62,8 @@ impl RenderLoop {
                 }
                 Job::Compare(request) => self.compare(id, &request).map(|message| (message, None)),
             };
-            let (message, frame) = result
-                .unwrap_or_else(|error| (Reply::Failure(Failure { message: error.to_string() }).to_bytes(&[]), None));
+            let (message, frame) =
+                result.unwrap_or_else(|error| (Reply::Failure { message: error.to_string() }.to_bytes(&[]), None));
             clients.finish(id, started.elapsed().as_secs_f64(), message, frame);
         }
     }

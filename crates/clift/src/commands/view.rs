@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use clift_data::{ClipReader, Split};
 use clift_eval::{EncodeOptions, EvalFrames, evaluation_items};
 use clift_model::{DeviceName, ModelConfig, Scene, load_renderer};
-use clift_view::{RunScenes, SceneFile, SceneSet, ServerOptions, ViewServer};
+use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
 use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
 use crate::commands::args::parse::parse_split;
@@ -53,7 +53,7 @@ pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
     let scene = args.scene.clone().map_or_else(shipped_model, Ok)?;
     let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene);
     let (scenes, device) = if is_run { open_run(&scene, args)? } else { open_file(&scene, args)? };
-    let server = ViewServer::bind(&ServerOptions { listen: args.listen, port: args.port })?;
+    let server = ViewServer::bind((args.listen, args.port).into())?;
     let (url, port) = (server.url(), server.address().port());
     print_result(&url)?;
     print_note(&format!(

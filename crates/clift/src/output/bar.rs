@@ -7,7 +7,7 @@ use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use crate::output::event_line::{event_line, step_metrics};
-use crate::output::plain::PlainLines;
+use crate::output::plain::{INTERVAL_S, PlainLines};
 use crate::output::stdout::{print_note, print_warning};
 use crate::output::units::{duration, rate};
 use crate::output::verbosity::Verbosity;
@@ -23,9 +23,9 @@ pub fn progress_sink() -> Box<dyn Sink> {
                 print_warning(text);
             }
         }),
-        Verbosity::Verbose => Box::new(PlainLines::new(std::io::stderr()).every_step()),
+        Verbosity::Verbose => Box::new(PlainLines::new(std::io::stderr(), 0.0)),
         Verbosity::Normal if std::io::stderr().is_terminal() => Box::new(Bar::default()),
-        Verbosity::Normal => Box::new(PlainLines::new(std::io::stderr())),
+        Verbosity::Normal => Box::new(PlainLines::new(std::io::stderr(), INTERVAL_S)),
     }
 }
 

@@ -8,10 +8,10 @@ use crate::output::event_line::{event_line, step_metrics};
 use crate::output::units::duration;
 use crate::output::visible::visible;
 
-/// Seconds of training between two progress lines.
-const INTERVAL_S: f64 = 10.0;
+/// Seconds of training between two progress lines, unless every step is wanted.
+pub const INTERVAL_S: f64 = 10.0;
 
-/// Lines for log files: events at once; steps every ten seconds of training, and the first and the last one.
+/// Lines for log files: events at once; steps every `interval_s` seconds of training, and the first and the last one.
 pub struct PlainLines<W> {
     out: W,
     since_line_s: f64,
@@ -23,13 +23,8 @@ pub struct PlainLines<W> {
 }
 
 impl<W: Write> PlainLines<W> {
-    pub fn new(out: W) -> Self {
-        Self { out, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0, interval_s: INTERVAL_S }
-    }
-
-    /// Prints a line for every step.
-    pub fn every_step(self) -> Self {
-        Self { interval_s: 0.0, ..self }
+    pub fn new(out: W, interval_s: f64) -> Self {
+        Self { out, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0, interval_s }
     }
 
     fn step_line(&mut self, event: &StepEvent) -> Option<String> {
@@ -80,7 +75,7 @@ mod tests {
     use crate::output::event_line::tests::step;
 
     fn printed(events: &[Event]) -> String {
-        let mut sink = PlainLines::new(Vec::new());
+        let mut sink = PlainLines::new(Vec::new(), INTERVAL_S);
         for event in events {
             sink.event(event);
         }

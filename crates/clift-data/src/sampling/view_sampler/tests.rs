@@ -97,8 +97,7 @@ fn stage_two_targets_are_no_contexts_while_others_exist() {
 
 #[test]
 fn farthest_point_reads_the_camera_centres() {
-    let config = crate::synthetic::config::SyntheticConfig { num_scenes: 1, num_frames: 40, ..Default::default() };
-    let source = crate::synthetic::source::SyntheticSource::new(config).unwrap();
+    let source = crate::testing::rooms(|c| c.num_frames = 40);
     let centres: Vec<_> = source.cameras(0).unwrap().iter().map(|camera| camera.c2w.translation.to_array()).collect();
     for inner in [InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even] {
         let sampler = ViewSampler { inner, ..sampler() };

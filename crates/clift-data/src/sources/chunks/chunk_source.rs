@@ -217,7 +217,7 @@ impl ChunkSource {
         }
         let names: Vec<String> = elsewhere.into_iter().collect();
         let what = "also in chunks other than those of index.json, not used";
-        self.report.notes.extend(note_on(&names, "scene", what));
+        self.report.notes.extend(note_on(&names, what));
     }
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {

@@ -89,7 +89,7 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
         }
     }
     duplicates.sort_unstable();
-    report.notes.extend(note_on(&duplicates, "scene", "in more than one file, the first of which is used"));
+    report.notes.extend(note_on(&duplicates, "in more than one file, the first of which is used"));
     let note = format!("no index.json: the scenes of {} files were determined from their contents", files.len());
     report.notes.push(note);
     index

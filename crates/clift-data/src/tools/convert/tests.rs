@@ -6,9 +6,8 @@ use crate::skip_report::SkippedScene;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::open::{OpenedSource, open_source};
 use crate::sources::options::SourceOptions;
-use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
-use crate::testing::{TestSource, assert_same, fixture, names, re10k_mini};
+use crate::testing::{self, TestSource, assert_same, fixture, names, re10k_mini};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
@@ -40,8 +39,7 @@ fn open(root: &Path, split: Split) -> OpenedSource {
 }
 
 fn rooms(num_scenes: usize) -> SyntheticSource {
-    let config = SyntheticConfig { num_scenes, num_frames: 3, width: 16, height: 8, ..Default::default() };
-    SyntheticSource::new(config).unwrap()
+    testing::rooms(|c| (c.num_scenes, c.num_frames, c.width, c.height) = (num_scenes, 3, 16, 8))
 }
 
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {

@@ -6,23 +6,29 @@ use safetensors::SafeTensors;
 
 use super::*;
 use crate::codec::token_codec::tests::codec;
-use crate::scene::scene::tests::scene;
+use crate::scene::scene::tests::{scene, with_header};
 use crate::scene::token_coding::TokenCoding;
 
 const STEP: f32 = 0.25;
+
+/// Writes the model of the scene, as far as reading looks at it, and returns its codec.
+fn write_model(folder: &Path) -> TokenCodec {
+    let (folder, Scene { model, kind, renderer_hash, .. }) = (folder.join("runs/tiny"), scene());
+    std::fs::create_dir_all(&folder).expect("a folder");
+    std::fs::write(folder.join("model.safetensors"), "").expect("writes");
+    std::fs::write(folder.join("config.toml"), "").expect("writes");
+    let codec = codec(model, kind, renderer_hash);
+    codec.write(&folder.join("codec.safetensors")).expect("writes");
+    codec
+}
 
 /// A folder with a model's codec, whose model path is that of the scene.
 struct Folder(tempfile::TempDir, TokenCodec);
 
 impl Folder {
     fn new() -> Self {
-        let (folder, Scene { model, kind, renderer_hash, .. }) = (tempfile::tempdir().expect("a folder"), scene());
-        let model_dir = folder.path().join("runs/tiny");
-        std::fs::create_dir_all(&model_dir).expect("a folder");
-        std::fs::write(model_dir.join("model.safetensors"), "").expect("writes");
-        std::fs::write(model_dir.join("config.toml"), "").expect("writes");
-        let codec = codec(model, kind, renderer_hash);
-        codec.write(&model_dir.join("codec.safetensors")).expect("writes");
+        let folder = tempfile::tempdir().expect("a folder");
+        let codec = write_model(folder.path());
         Self(folder, codec)
     }
 
@@ -49,16 +55,6 @@ fn checked(mut bytes: Vec<u8>) -> Vec<u8> {
     let checksum = crc32fast::hash(&bytes[..end]);
     bytes[end..].copy_from_slice(&checksum.to_le_bytes());
     bytes
-}
-
-/// The header with `from` replaced, and a checksum that fits.
-fn with_header(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
-    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
-    let header = String::from_utf8(bytes[8..8 + length].to_vec()).unwrap();
-    assert!(header.contains(from), "{header}");
-    let header = header.replace(from, to);
-    let start = (header.len() as u64).to_le_bytes();
-    checked([&start[..], header.as_bytes(), &bytes[8 + length..]].concat())
 }
 
 #[test]
@@ -134,13 +130,15 @@ fn hostile_files_with_valid_checksums_are_refused() {
         ("\"scene\":{", "\"scenf\":{", "no tensor `scene`"),
         ("\"version\":\"3\"", "\"version\":\"4\"", "version \"4\", expected \"1\", \"2\" or \"3\""),
     ] {
-        let message = folder.refusal_of(&with_header(&bytes, from, to));
+        let message = folder.refusal_of(&checked(with_header(&bytes, &[(from, to)])));
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
     }
     // Many tokens that a small file claims.
-    let many = with_header(&bytes, "\"height\":\"16\",\"width\":\"24\"", "\"height\":\"4096\",\"width\":\"4096\"");
-    let many = with_header(&many, "\"tokens\":\"5\"", "\"tokens\":\"524288\"");
-    assert!(folder.refusal_of(&many).contains("expected at most"), "bounded memory");
+    let many = [
+        ("\"height\":\"16\",\"width\":\"24\"", "\"height\":\"4096\",\"width\":\"4096\""),
+        ("\"tokens\":\"5\"", "\"tokens\":\"524288\""),
+    ];
+    assert!(folder.refusal_of(&checked(with_header(&bytes, &many))).contains("expected at most"), "bounded memory");
     let start = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
     for (at, value, expected) in [
         (0, &f32::NAN.to_le_bytes()[..], "step NaN"),
@@ -170,14 +168,9 @@ fn codecs_of_other_models_are_refused() {
 #[test]
 fn fixture_has_the_tokens_of_the_python_decoder() {
     let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/coded");
-    let [room, model] = ["room.clift", "runs/tiny"].map(|name| fixture.join(name));
+    let room = fixture.join("room.clift");
     if std::env::var_os("CLIFT_UPDATE").is_some() {
-        let Scene { model: sizes, kind, renderer_hash, .. } = scene();
-        let codec = codec(sizes, kind, renderer_hash);
-        std::fs::create_dir_all(&model).unwrap();
-        std::fs::write(model.join("model.safetensors"), "").unwrap();
-        std::fs::write(model.join("config.toml"), "").unwrap();
-        codec.write(&model.join("codec.safetensors")).unwrap();
+        let codec = write_model(&fixture);
         let mut unusual = scene();
         unusual.tokens[10] = -1e3; // escapes
         unusual.write_coded(&room, &codec, STEP).unwrap();

@@ -38,6 +38,18 @@ pub(crate) fn scene() -> Scene {
     }
 }
 
+/// The file with changes in its header.
+pub(crate) fn with_header(bytes: &[u8], changes: &[(&str, &str)]) -> Vec<u8> {
+    let (length, rest) = bytes.split_first_chunk().expect("a length");
+    let (header, rest) = rest.split_at(u64::from_le_bytes(*length) as usize);
+    let mut header = std::str::from_utf8(header).expect("text").trim_end().to_owned();
+    for (from, to) in changes {
+        assert!(header.contains(from), "{from} is not in {header}");
+        header = header.replace(from, to);
+    }
+    [&(header.len() as u64).to_le_bytes(), header.as_bytes(), rest].concat()
+}
+
 struct Folder(tempfile::TempDir);
 
 impl Folder {
@@ -65,14 +77,7 @@ impl Folder {
     }
 
     fn assert_header_refused(&self, changes: &[(&str, &str)], expected: &str) {
-        let bytes = self.bytes(TokenFormat::F32);
-        let mut header = String::from_utf8(bytes[8..8 + HEADER_BYTES].to_vec()).expect("text").trim_end().to_owned();
-        for (from, to) in changes {
-            assert!(header.contains(from), "{from} is not in {header}");
-            header = header.replace(from, to);
-        }
-        let length = (header.len() as u64).to_le_bytes();
-        self.assert_refused(&[&length[..], header.as_bytes(), &bytes[8 + HEADER_BYTES..]].concat(), expected);
+        self.assert_refused(&with_header(&self.bytes(TokenFormat::F32), changes), expected);
     }
 
     fn write_error(&self, scene: &Scene, name: &str, format: TokenFormat) -> String {
@@ -110,15 +115,12 @@ fn latents_are_stored_without_places() {
         assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..latents.clone() }, format.into()));
     }
     let bytes = std::fs::read(folder.path()).expect("reads");
-    let changed = |from: &str, to: &str| {
-        let at = bytes.windows(from.len()).position(|part| part == from.as_bytes()).expect("in the header");
-        [&bytes[..at], to.as_bytes(), &bytes[at + from.len()..]].concat()
-    };
-    folder.assert_refused(&changed(r#"\"dim\":8"#, r#"\"dim\":0"#), "`model.dim` = 0");
-    folder.assert_refused(
-        &changed(r#"\"num_latents\":5"#, r#"\"num_latents\":4"#),
-        "`token_scales` is F32 [5], expected F32 [4]",
-    );
+    for (from, to, expected) in [
+        (r#"\"dim\":8"#, r#"\"dim\":0"#, "`model.dim` = 0"),
+        (r#"num_latents\":5"#, r#"num_latents\":4"#, "`token_scales` is F32 [5], expected F32 [4]"),
+    ] {
+        folder.assert_refused(&with_header(&bytes, &[(from, to)]), expected);
+    }
     let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
     assert!(folder.write_error(&few, "few", TokenFormat::F32).contains("expected all 5 latents in order"));
     let kind = Scene { kind: TokenKind::Clift, ..latents };

@@ -2,6 +2,7 @@
 
 use std::str::FromStr;
 
+use serde::Deserialize;
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
@@ -16,7 +17,8 @@ const SCALED_CELLS: f64 = 16.0;
 const MARGIN_CELLS: usize = 4;
 
 /// A named set of rules.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Display, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
 pub enum SelectionPreset {
     /// Algorithm 1 of the paper: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous frame.

@@ -6,8 +6,7 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::ValueEnum;
 use clift_data::{
-    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene,
-    UnreadableImage, plural,
+    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkippedScene, UnreadableImage, plural,
 };
 
 use crate::commands::args::parse::parse_count;
@@ -55,8 +54,18 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
         let mut counter = Counter::new(&split.name(), split.opened.source.num_scenes() as u64);
         let report = converter.run(|done| counter.set(done as u64))?;
         drop(counter);
-        print_skips(&report.skipped, &folder);
-        print_unreadable(&report.unreadable, &folder);
+        // Scenes reserved for testing are part of the other split.
+        let skips = report.skipped.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
+        print_some(skips.map(|SkippedScene { key, reason }| format!("skipped {}: {reason}", visible_line(key))));
+        if report.skipped.has_skips() {
+            print_note(&format!("all skipped scenes and frames: {}", folder.join("skipped.json").display()));
+        }
+        print_some(report.unreadable.iter().map(|UnreadableImage { key, frame, reason }| {
+            format!("unreadable: frame {frame} of scene {}: {reason}", visible_line(key))
+        }));
+        if !report.unreadable.is_empty() {
+            print_note(&format!("all unreadable images: {}", folder.join("unreadable.json").display()));
+        }
         num_unreadable += report.unreadable.len();
         print_result(&describe(split, &report, started.elapsed().as_secs_f64(), &folder))?;
         if report.num_scenes == 0 {
@@ -73,16 +82,12 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn print_unreadable(images: &[UnreadableImage], folder: &Path) {
-    for UnreadableImage { key, frame, reason } in images.iter().take(MAX_LISTED) {
-        print_note(&format!("unreadable: frame {frame} of scene {}: {reason}", visible_line(key)));
-    }
-    let num_more = images.len().saturating_sub(MAX_LISTED);
+/// Prints the first lines and the number of the others.
+fn print_some(mut lines: impl Iterator<Item = String>) {
+    lines.by_ref().take(MAX_LISTED).for_each(|line| print_note(&line));
+    let num_more = lines.count();
     if num_more > 0 {
-        print_note(&format!("unreadable: {}", plural(num_more, "more image")));
-    }
-    if !images.is_empty() {
-        print_note(&format!("all unreadable images: {}", folder.join("unreadable.json").display()));
+        print_note(&format!("and {num_more} more"));
     }
 }
 
@@ -111,21 +116,6 @@ fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder
         file_size(*image_bytes),
         folder.display(),
     )
-}
-
-fn print_skips(report: &SkipReport, folder: &Path) {
-    // Scenes reserved for testing are part of the other split.
-    let skips: Vec<&SkippedScene> = report.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING).collect();
-    for skip in skips.iter().take(MAX_LISTED) {
-        print_note(&format!("skipped {}: {}", visible_line(&skip.key), skip.reason));
-    }
-    let num_more = skips.len().saturating_sub(MAX_LISTED);
-    if num_more > 0 {
-        print_note(&format!("skipped {num_more} more"));
-    }
-    if report.has_skips() {
-        print_note(&format!("all skipped scenes and frames: {}", folder.join("skipped.json").display()));
-    }
 }
 
 /// Checks that neither folder contains the other: the output would change the input.

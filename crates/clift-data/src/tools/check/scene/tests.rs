@@ -9,8 +9,7 @@ use super::*;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::geometry::pose::Pose;
-use crate::synthetic::config::SyntheticConfig;
-use crate::synthetic::source::SyntheticSource;
+use crate::testing;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, Verdict};
 
 struct RenderedRoom {
@@ -22,17 +21,10 @@ struct RenderedRoom {
 fn rooms() -> &'static [RenderedRoom] {
     static ROOMS: OnceLock<Vec<RenderedRoom>> = OnceLock::new();
     ROOMS.get_or_init(|| {
-        let config = SyntheticConfig {
-            num_scenes: 2,
-            num_frames: 12,
-            width: 320,
-            height: 240,
-            path_length: 1.2,
-            texture_frequency: 3.0,
-            specular: 0.1,
-            ..Default::default()
-        };
-        let source = SyntheticSource::new(config).unwrap();
+        let source = testing::rooms(|c| {
+            (c.num_frames, c.width, c.height) = (12, 320, 240);
+            (c.path_length, c.texture_frequency, c.specular) = (1.2, 3.0, 0.1);
+        });
         let rendered = |scene: usize| RenderedRoom {
             cameras: source.cameras(scene).unwrap(),
             frames: (0..12).into_par_iter().map(|frame| source.frame(scene, frame).unwrap()).collect(),
@@ -197,8 +189,7 @@ fn implausible_cameras_fail_with_the_reason() {
 
 #[test]
 fn repeated_and_unreadable_frames_are_reported() {
-    let config = SyntheticConfig { num_scenes: 1, num_frames: 8, width: 48, height: 32, ..Default::default() };
-    let source = SyntheticSource::new(config).unwrap();
+    let source = testing::rooms(|c| (c.num_frames, c.width, c.height) = (8, 48, 32));
     let frames = (0..8).map(|frame| source.frame(0, frame).unwrap()).collect();
     let room: &'static RenderedRoom = Box::leak(Box::new(RenderedRoom { cameras: source.cameras(0).unwrap(), frames }));
     let of = |frame: fn(usize) -> usize, cameras: fn(usize, &mut Camera)| {
