@@ -23,7 +23,7 @@ pub const CASES: &[Case] = &[
     Tolerance::forward(1e-6, "a division, a root and three products: each may round another way")
         .case("rays of every pixel", |place| forward(plucker(&place.targets()).flatten(0, 4))),
     Tolerance::forward(0.0, "a look-up in a table")
-        .case("8-bit images", |place| forward(place.context().images.flatten(0, 4))),
+        .case("8-bit images to values", |place| forward(place.context().images.flatten(0, 4))),
     Tolerance::forward(0.0, "values are moved, not changed").case("images to patches and back", |place| {
         let images = place.random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 1);
         let patches = patchify(images, 8);
