@@ -85,14 +85,14 @@ fn fresh_moves_the_former_run_aside() {
 #[test]
 fn an_evaluation_can_be_interrupted() {
     let place = Place::new();
-    place.train("run", &["data.synthetic.num_scenes=400"]).ok();
-    // Hundreds of scenes with rows of targets: far longer than the signal takes.
-    let words = "eval DIR/run --set eval.num_scenes=0 --set eval.num_sheets=400";
+    place.train("run", &["data.synthetic.num_scenes=2000"]).ok();
+    // Thousands of scenes with rows of targets: far longer than the signal takes.
+    let words = "eval DIR/run --set eval.num_scenes=0 --set eval.num_sheets=2000";
     let before = files(&place.at("run/eval"));
     place.clift(words).fails_with(2, &["/run/eval: the folder holds an evaluation; replace it with --force"]);
     // A finished run is not evaluated again either.
     place
-        .train("run", &["data.synthetic.num_scenes=400", "eval.num_scenes=4"])
+        .train("run", &["data.synthetic.num_scenes=2000", "eval.num_scenes=4"])
         .ok()
         .notes("--force` evaluates it again");
     assert!(files(&place.at("run/eval")) == before, "nothing is replaced unasked");
