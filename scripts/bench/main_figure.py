@@ -48,10 +48,22 @@ class Figure:
         return json.loads((out / "summary.json").read_text())["points"]
 
 
-def steps(run: Path) -> list[float]:
-    """Seconds of every step of all stages."""
-    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [row["step_s"] for row in rows]
+def steps(run: Path) -> dict[str, list[float]]:
+    """Seconds of every step by stage."""
+    found: dict[str, list[float]] = {}
+    for line in (run / "metrics.jsonl").read_text().splitlines():
+        row = json.loads(line)
+        found.setdefault(row["stage"], []).append(row["step_s"])
+    return found
+
+
+def num_steps(run: Path) -> int:
+    return sum(len(stage) for stage in steps(run).values())
+
+
+def seconds(run: Path) -> float:
+    """Time of all steps at the median of their stage, so that an interruption of the machine does not count."""
+    return sum(len(stage) * statistics.median(stage) for stage in steps(run).values())
 
 
 def cell(values: list[float], digits: int) -> str:
@@ -91,24 +103,23 @@ def main() -> None:
     evaluations: dict[str, list[list[dict]]] = {"steps": [], "time": []}
     for number, seed in enumerate(int(seed) for seed in args.seeds.split(",")):
         clift = figure.train("clift", f"clift-{seed}", seed)
-        budget = steps(clift)
         others: dict[str, list[Path]] = {"steps": [], "time": []}
         for count in latents[: 1 if number else None]:
 
-            def lvsm(kind: str, num_steps: int) -> Path:
-                changes = (f"model.num_latents={count}", f"stage1.steps={num_steps}")
+            def lvsm(kind: str, count_of_steps: int) -> Path:
+                changes = (f"model.num_latents={count}", f"stage1.steps={count_of_steps}")
                 return figure.train("lvsm", f"lvsm-{count}-{kind}-{seed}", seed, *changes)
 
-            others["steps"].append(lvsm("steps", len(budget)))
-            seconds = statistics.median(steps(others["steps"][-1]))
+            others["steps"].append(lvsm("steps", num_steps(clift)))
+            step_s = statistics.median(steps(others["steps"][-1])["stage1"])
             # Written down once: a resumed training needs the same number of steps.
             file = figure.out / f"lvsm-{count}-time-{seed}.json"
             if not file.exists():
-                file.write_text(json.dumps(round(sum(budget) / seconds)))
+                file.write_text(json.dumps(round(seconds(clift) / step_s)))
             others["time"].append(lvsm("time", json.loads(file.read_text())))
         for kind, runs in others.items():
             evaluations[kind].append(figure.evaluate(clift, runs, f"{kind}-{seed}"))
-            sizes = ", ".join(f"{run.name}: {len(steps(run))} steps, {sum(steps(run)):.0f} s" for run in [clift, *runs])
+            sizes = ", ".join(f"{run.name}: {num_steps(run)} steps, {seconds(run):.0f} s" for run in [clift, *runs])
             print(f"seed {seed}, equal {kind}: {sizes}")
     for kind, points in evaluations.items():
         table(f"Equal {kind}", points)
