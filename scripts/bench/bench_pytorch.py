@@ -177,10 +177,15 @@ class Bench:
             key = (side.work.removesuffix("_unshared"), side.size, f"{side.precision} {variant}")
             if key not in self.probed:
                 self.wait()
-                self.probed[key] = min(self.measure(side, None, variant).samples)
-                print(f"  PyTorch, {variant}: {seconds(self.probed[key])}", flush=True)
+                try:
+                    self.probed[key] = min(self.measure(side, None, variant).samples)
+                except CommandFailed as error:
+                    # One way may need what is missing here: torch.compile needs a C++ compiler.
+                    print(f"  PyTorch, {variant}: failed: {str(error).strip().splitlines()[-1]}", flush=True)
+                    continue
+                print(f"  PyTorch {side.precision}, {variant}: {seconds(self.probed[key])}", flush=True)
             times[variant] = self.probed[key]
-        return min(times, key=times.__getitem__), times
+        return (min(times, key=times.__getitem__) if times else variants[0]), times
 
     def round(self, sides: list[Side], chosen: dict[Side, str | None], round_: int) -> dict[Side, Measured | str]:
         """Measures all sides once, again and again until nobody disturbs. A side that fails gives its error."""
