@@ -181,7 +181,7 @@ class Bench:
                     self.probed[key] = min(self.measure(side, None, variant).samples)
                 except CommandFailed as error:
                     # One way may need what is missing here: torch.compile needs a C++ compiler.
-                    print(f"  PyTorch, {variant}: failed: {str(error).strip().splitlines()[-1]}", flush=True)
+                    print(f"  PyTorch {side.precision}, {variant}: failed: {str(error).strip().splitlines()[-1]}", flush=True)
                     continue
                 print(f"  PyTorch {side.precision}, {variant}: {seconds(self.probed[key])}", flush=True)
             times[variant] = self.probed[key]

@@ -106,8 +106,8 @@ def main() -> None:
         others: dict[str, list[Path]] = {"steps": [], "time": []}
         for count in latents[: 1 if number else None]:
 
-            def lvsm(kind: str, count_of_steps: int) -> Path:
-                changes = (f"model.num_latents={count}", f"stage1.steps={count_of_steps}")
+            def lvsm(kind: str, length: int) -> Path:
+                changes = (f"model.num_latents={count}", f"stage1.steps={length}")
                 return figure.train("lvsm", f"lvsm-{count}-{kind}-{seed}", seed, *changes)
 
             others["steps"].append(lvsm("steps", num_steps(clift)))

@@ -102,8 +102,8 @@ impl<'a> ProductKernel for Forward<'a> {
                 multiply::<S, O>(simd, [rows, inner, count], left, right, (scores, score_row), false);
                 for row in 0..rows {
                     let scores = &mut scores[row * score_row..][..count];
-                    let scale_of_base_2 = sizes.scale() * std::f32::consts::LOG2_E;
-                    let shrink = exponentials(simd, scores, scale_of_base_2, &mut highest[row], &mut total[row]);
+                    let factor = sizes.scale_of_exponents();
+                    let shrink = exponentials(simd, scores, factor, &mut highest[row], &mut total[row]);
                     pack_in_place::<S, O>(simd, scores);
                     if shrink != 1.0 {
                         scale(simd, &mut sums[row * width..][..width], shrink);

@@ -27,6 +27,11 @@ impl AttentionSizes {
         (1.0 / (self.head_width as f64).sqrt()) as f32
     }
 
+    /// Returns the factor of products of queries and keys in exponents of 2.
+    pub(crate) fn scale_of_exponents(&self) -> f32 {
+        self.scale() * std::f32::consts::LOG2_E
+    }
+
     /// Returns the parts that the blocks of a head are divided into, for 16 threads: by shape alone, for equal sums.
     pub(crate) fn parts(&self, blocks: usize) -> usize {
         16_usize.div_ceil((self.batch * self.num_heads).max(1)).clamp(1, blocks.max(1))

@@ -1,4 +1,4 @@
-//! Products of matrices that stay in the cache, the building block of attention.
+//! Products of matrices that stay in the cache, the building block of attention and of products in bf16.
 // M rows, K inner, N columns
 
 use crate::simd::vector::{Operands, Simd, Tile};

@@ -171,7 +171,8 @@ pub trait Operands: Copy + Send + Sync + 'static {
     fn multiply_add<S: Simd>(simd: S, a: S::V, b: S::V, sum: S::V) -> S::V;
     /// Reads lanes `lane..` of a row along the inner dimension; missing values are zero.
     fn along<S: Simd>(simd: S, row: &[f32], lane: usize) -> S::V;
-    /// Reads one lane of columns `column..` from the next rows across the inner dimension; missing values are zero.
+    /// Reads columns `column..` of one lane: of the next [`Operands::PER_LANE`] rows, which lie across the inner dimension.
+    /// Missing values are zero.
     fn across<S: Simd>(simd: S, rows: [&[f32]; 2], column: usize) -> S::V;
 }
 

@@ -140,8 +140,8 @@ impl Drop for PrecisionScope {
 pub trait MatmulKernels: Backend {
     /// Multiplies matrices; f32 operands are rounded to `precision`, operands of another type (f64, in tests) are not.
     fn matmul(precision: Precision, lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
+        let precision = if lhs.dtype() == DType::F32 { precision } else { Precision::F32 };
         match precision {
-            _ if lhs.dtype() != DType::F32 => Self::float_matmul(lhs, rhs),
             Precision::F32 => Self::float_matmul(lhs, rhs),
             Precision::Bf16 => Self::matmul_bf16(lhs, rhs),
             Precision::F16 => {
@@ -188,12 +188,11 @@ mod tests {
     use super::*;
     use crate::testing::{devices, random, to_vec};
 
-    /// Devices with their precisions below f32.
+    /// Devices with f16, and flex in bf16, which processors without the instructions emulate.
     fn reduced_precisions() -> impl Iterator<Item = (Device, Precision)> {
-        let pairs = devices()
-            .into_iter()
-            .flat_map(|device| [Precision::Bf16, Precision::F16].map(|precision| (device.clone(), precision)));
-        pairs.filter(|(device, precision)| precision.check("precision", device).is_ok())
+        let f16 = devices().into_iter().map(|device| (device, Precision::F16));
+        let f16 = f16.filter(|(device, precision)| precision.check("precision", device).is_ok());
+        f16.chain([(Device::flex(), Precision::Bf16)])
     }
 
     #[test]
@@ -292,12 +291,13 @@ mod tests {
         for (device, precision) in reduced_precisions() {
             let f32 = errors(&results(&device, Precision::F32, DType::F32));
             let reduced = errors(&results(&device, precision, DType::F32));
-            // f16 has 13 bits less than f32, bf16 16; the error of few values varies widely.
-            let step = if precision == Precision::F16 { 1.0 } else { 8.0 };
+            // f16 has 13 bits less than f32, bf16 16; the error of few values varies widely. The weights are large: rounded
+            // scores move the softmax.
+            let (step, most) = if precision == Precision::F16 { (1.0, 3e-2) } else { (8.0, 4e-1) };
             for (i, (reduced, f32)) in reduced.iter().zip(&f32).enumerate() {
                 let ratio = reduced / f32 / step;
                 assert!((200.0..40_000.0).contains(&ratio), "{precision}, {i}: {reduced:.1e} and {f32:.1e}");
-                assert!(*reduced < 6e-2 * step, "{precision}, {i}: {reduced:.1e}");
+                assert!(*reduced < most, "{precision}, {i}: {reduced:.1e}");
             }
         }
     }

@@ -1,8 +1,9 @@
 //! Weight files, published names, and trained models.
 //!
-//! `file` reads and writes safetensors in PyTorch's layout, `tensors` single tensors of other files; `hash` identifies a set of weights; `model_path` finds the
-//! weights and config of a run, and `trained_model` opens them. `published_keys` maps parameter names to those of
-//! published checkpoints, and `published_sizes` infers the sizes of a network from the shapes in a checkpoint.
+//! `file` reads and writes safetensors in PyTorch's layout, `tensors` single tensors of other files; `hash` identifies a set
+//! of weights; `model_path` finds the weights and config of a run, and `trained_model` opens them. `published_keys` maps
+//! parameter names to those of published checkpoints, and `published_sizes` infers the sizes of a network from the shapes in
+//! a checkpoint.
 
 pub(crate) mod file;
 pub(crate) mod hash;

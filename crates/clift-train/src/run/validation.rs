@@ -72,8 +72,8 @@ impl<'a> Validation<'a> {
     }
 
     /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with
-    /// one count of condensed tokens in stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB; `None` if no view could be measured
-    /// or `stop` is set.
+    /// one count of condensed tokens in stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB;
+    /// `None` if no view could be measured or `stop` is set.
     ///
     /// # Errors
     /// As [`Evaluator::measure`]; a scene that cannot be read is skipped.

@@ -1,4 +1,4 @@
-//! `clift bench`: times of the method (`cases`), of f16 beside f32 (`precision`), of reading clips (`data`), and of
+//! `clift bench`: times of the method (`cases`), of f16 or bf16 beside f32 (`precision`), of reading clips (`data`), and of
 //! the sum over ranks (`allreduce`).
 //!
 //! `timing_args` has the options that `cases` and `precision` share.

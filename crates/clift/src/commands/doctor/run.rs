@@ -40,9 +40,8 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
             probe(name, Precision::F32).and_then(|probe| check(probe, expected, TOLERANCE))
         };
         for (precision, tolerance) in [(Precision::Bf16, TOLERANCE_BF16), (Precision::F16, TOLERANCE_F16)] {
-            let has_bf16 = || name.open().is_ok_and(|device| Precision::Bf16.check("precision", &device).is_ok());
             let offers = |probe: &DeviceCheck| match precision {
-                Precision::Bf16 => has_bf16(),
+                Precision::Bf16 => name == DeviceName::Flex && InstructionSet::detected().has_bf16(),
                 // What offers f16 and cannot be used gets a row with the reason.
                 _ => probe.dtypes.contains(&"f16"),
             };

@@ -52,7 +52,8 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     check_size(&scene, [width, height], args.render.is_some(), device)?;
     if [width, height] != [scene.width, scene.height] {
         print_note(&format!(
-            "warning: the network was trained on images of {} x {}; frames of {width} x {height} show its patches as a grid",
+            "warning: the network was trained on images of {} x {}; frames of {width} x {height} show its patches as a \
+             grid, or the picture several times",
             scene.width, scene.height
         ));
     }
