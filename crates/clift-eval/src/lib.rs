@@ -87,4 +87,4 @@ pub use figures::video::Video;
 
 // The machine, for reports.
 pub use system::machine::machine_rows;
-pub use system::memory::{available_bytes, peak_bytes, start_peak};
+pub use system::memory::{available_bytes, keep_freed_memory, peak_bytes, start_peak};

@@ -12,8 +12,10 @@ use crate::simd::vector::{Bf16, Simd};
 /// Values along the inner dimension that are multiplied before the next ones: a panel of B takes 16 KB, half of the
 /// smallest L1 cache.
 const INNER_BLOCK: usize = 256;
-/// Rows of a task: its part of A stays in the L2 cache.
+/// Most rows of a task: its part of A stays in the L2 cache.
 const ROW_BLOCK: usize = 96;
+/// Fewest rows of a task: every task reads the whole of B.
+const FEWEST_ROWS: usize = 24;
 
 /// A matrix in a slice. Its rows are contiguous, or its columns if it is `transposed`.
 #[derive(Clone, Copy, Debug)]
@@ -47,8 +49,9 @@ pub fn matmul_bf16(
             set.run(PackPanel { b, inner, columns, layout, index: [i / layout.num_panels, i % layout.num_panels], to });
         });
     }
-    output.par_chunks_mut(ROW_BLOCK * columns).enumerate().for_each(|(i, to)| {
-        set.run(RowBlock { a, packed: &packed, layout, sizes: [rows, inner, columns], first: i * ROW_BLOCK, bias, to });
+    let block = rows.div_ceil(4 * rayon::current_num_threads()).next_multiple_of(FEWEST_ROWS).min(ROW_BLOCK);
+    output.par_chunks_mut(block * columns).enumerate().for_each(|(i, to)| {
+        set.run(RowBlock { a, packed: &packed, layout, sizes: [rows, inner, columns], first: i * block, bias, to });
     });
 }
 
@@ -135,15 +138,20 @@ impl Kernel for RowBlock<'_> {
         let (count, whole) = (to.len() / columns, padded::<S>(columns));
         let a_width = if a.transposed { padded::<S>(count) } else { layout.lanes };
         let a_len = a_width * if a.transposed { layout.lanes } else { count };
-        let mut scratch = Scratch::take(a_len + count * whole);
-        let [left, sums] = scratch.cut([a_len, if whole == columns { 0 } else { count * whole }]);
         // The register tile writes whole vectors.
         let in_place = whole == columns;
+        let lens = [a_len, if in_place { 0 } else { count * whole }];
+        let mut scratch = Scratch::take(lens.iter().sum());
+        let [left, sums] = scratch.cut(lens);
         let result = if in_place { &mut *to } else { &mut *sums };
-        for row in result.chunks_exact_mut(whole) {
-            let filled = bias.map_or(0, <[f32]>::len);
-            row[..filled].copy_from_slice(bias.unwrap_or_default());
-            row[filled..].fill(0.0);
+        // Without a bias the first block overwrites what is there.
+        let starts_filled = bias.is_some() || inner == 0;
+        if starts_filled {
+            let bias = bias.unwrap_or_default();
+            for row in result.chunks_exact_mut(whole) {
+                row[..bias.len()].copy_from_slice(bias);
+                row[bias.len()..].fill(0.0);
+            }
         }
         for block in 0..inner.div_ceil(INNER_BLOCK) {
             let inside = range(block, INNER_BLOCK, inner);
@@ -159,7 +167,8 @@ impl Kernel for RowBlock<'_> {
             let panels = &packed[block * layout.num_panels * layout.panel_len()..];
             let right = Right { values: panels, step: layout.width, panel: layout.panel_len() };
             let left = Left { values: left, row, step };
-            multiply::<S, Bf16>(simd, [count, lanes, columns], left, right, (result, whole), true);
+            let accumulate = starts_filled || block > 0;
+            multiply::<S, Bf16>(simd, [count, lanes, columns], left, right, (result, whole), accumulate);
         }
         if !in_place {
             for (to, row) in to.chunks_exact_mut(columns).zip(sums.chunks_exact(whole)) {
@@ -220,6 +229,8 @@ mod tests {
         let mut output = [f32::NAN; 4];
         matmul_bf16(InstructionSet::detected(), [2, 0, 2], [empty, empty], Some(&[1.0, 2.0]), &mut output);
         assert_eq!(output, [1.0, 2.0, 1.0, 2.0]);
+        matmul_bf16(InstructionSet::detected(), [2, 0, 2], [empty, empty], None, &mut output);
+        assert_eq!(output, [0.0; 4]);
         for set in InstructionSet::available() {
             let matrix = |values| Matrix { values, transposed: false };
             let mut output = [0.0; 3];

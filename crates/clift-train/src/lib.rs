@@ -62,7 +62,7 @@ pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{ImageLoss, Loss, LossParts, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;
-pub use step::optimizer::{clip_global_norm, global_norm, make_optimizer};
+pub use step::optimizer::{StageOptimizer, clip_global_norm, global_norm};
 pub use step::schedule::learning_rate;
 pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};

@@ -15,10 +15,13 @@ mod interrupt;
 mod output;
 #[cfg(test)]
 mod reference;
+mod threads;
 
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
+use clift_eval::keep_freed_memory;
+use clift_train::Launched;
 
 use crate::cli::{Args, Command};
 use crate::commands::bench::cases::{BenchArgs, BenchCommand};
@@ -36,6 +39,10 @@ use crate::output::stdout;
 pub fn main() -> ExitCode {
     let args = Args::parse();
     args.verbosity().choose();
+    keep_freed_memory();
+    if Launched::find().num_ranks == 1 {
+        threads::start(None);
+    }
     clift_data::observe_census(count_chunks);
     let result = match args.command {
         Command::Train(args) => train::run(&args),

@@ -5,8 +5,8 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 use clift_train::{
-    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, StepAnomaly, TrainError, TrainState, freeze,
-    learning_rate, make_optimizer, render_loss, seeded_batch,
+    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageOptimizer, StageSettings, StepAnomaly, TrainError,
+    TrainState, freeze, learning_rate, render_loss, seeded_batch,
 };
 
 use crate::cases::context::BenchContext;
@@ -45,7 +45,7 @@ impl StepCase {
 pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
     TrainState {
         model: freeze(stage, context.model()),
-        optimizer: make_optimizer(context.config.stage(stage).optimizer),
+        optimizer: StageOptimizer::new(context.config.stage(stage).optimizer),
         device: context.device.clone().autodiff(),
         loss: Loss::default(),
         activation_checkpointing: context.config.activation_checkpointing,

@@ -1,8 +1,28 @@
-//! Peak and free memory, on Linux.
+//! Kept, peak and free memory, on Linux.
 
 use clift_model::DeviceName;
 
 use crate::system::machine::proc_field;
+
+/// Lets the process keep freed memory, for its next allocation: fresh pages, which the system fills with zeros, take 5 to 9 %
+/// of a training step.
+pub fn keep_freed_memory() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        use std::ffi::c_int;
+        unsafe extern "C" {
+            fn mallopt(parameter: c_int, value: c_int) -> c_int;
+        }
+        const M_TRIM_THRESHOLD: c_int = -1;
+        const M_MMAP_MAX: c_int = -4;
+        // SAFETY: mallopt is a function of the linked C library; both values are valid (mallopt(3)): never return the end of
+        // the heap, no allocations outside of it.
+        unsafe {
+            mallopt(M_TRIM_THRESHOLD, -1);
+            mallopt(M_MMAP_MAX, 0);
+        }
+    }
+}
 
 /// Resets the peak to the current resident memory. Returns `None` where the system has no resettable peak.
 pub fn start_peak() -> Option<()> {

@@ -69,7 +69,7 @@ impl Checkpoints {
             |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
         let record = train_state.model.clone().into_record();
         record.save(temporary.join(MODEL)).map_err(|error| failed(MODEL, error.to_string()))?;
-        let saved = train_state.optimizer.save(temporary.join(OPTIMIZER));
+        let saved = train_state.optimizer.to_record().save(temporary.join(OPTIMIZER));
         saved.map_err(|error| failed(OPTIMIZER, error.to_string()))?;
         let mut files = BTreeMap::new();
         for name in [MODEL, OPTIMIZER] {

@@ -5,7 +5,8 @@
 //! - `gradient_sum`: gradients of all ranks
 //! - `loss`: MSE and perceptual term
 //! - `loss_scale`: loss scaling for f16
-//! - `optimizer`: `AdamW`, gradient norm and clipping
+//! - `muon`: Muon, matrices side by side
+//! - `optimizer`: `AdamW` or Muon for a stage, gradient norm and clipping
 //! - `schedule`: warm-up and cosine
 //! - `seeded_inputs`: batches and weights from a seed, for tests and benchmarks
 //! - `activation_checkpointing`: backward from stored block inputs
@@ -18,6 +19,7 @@ pub(crate) mod device_batch;
 pub(crate) mod gradient_sum;
 pub(crate) mod loss;
 pub(crate) mod loss_scale;
+pub(crate) mod muon;
 pub(crate) mod optimizer;
 pub(crate) mod schedule;
 pub(crate) mod seeded_inputs;

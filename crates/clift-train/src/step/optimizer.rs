@@ -1,34 +1,64 @@
 //! AdamW and Muon, global gradient norm and clipping.
 
 use burn::module::{Module, ModuleVisitor, Param, ParamGroup};
-use burn::optim::decay::WeightDecayConfig;
-use burn::optim::{AdamWConfig, AdjustLrFn, GradientsParams, ModuleOptimizer, MuonConfig};
+use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
+use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer, OptimizerRecord};
 use burn::tensor::Tensor;
 
 use crate::config::config::{Algorithm, OptimizerConfig};
+use crate::step::muon::Muon;
 
-/// Makes the optimizer of a config: AdamW with the reference's epsilon of 1e-8, and, if the config names Muon, Muon for the
-/// weight matrices of the transformer blocks. Weight decay applies to every parameter.
+/// The optimizer of a stage: AdamW with the reference's epsilon of 1e-8, and, if the config names Muon, Muon for the weight
+/// matrices of the transformer blocks. Weight decay applies to every parameter.
 ///
 /// Muon's updates are scaled to the size of AdamW's (`0.2 sqrt(max(rows, columns))`, arXiv 2502.16982), so that both
 /// optimizers share learning rate and weight decay.
-///
-/// # Panics
-/// Never: the pattern of the paths is valid.
-pub fn make_optimizer(config: &OptimizerConfig) -> ModuleOptimizer {
-    let weight_decay = config.weight_decay as f32;
-    let [beta_1, beta_2] = config.betas.map(|beta| beta as f32);
-    let adamw = AdamWConfig::new().with_beta_1(beta_1).with_beta_2(beta_2).with_epsilon(1e-8);
-    let adamw = adamw.with_weight_decay(weight_decay);
-    match config.algorithm {
-        Algorithm::Adamw => adamw.init(),
-        Algorithm::Muon => {
-            let muon = MuonConfig::new()
-                .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
-                .with_weight_decay(Some(WeightDecayConfig::new(weight_decay)));
-            let matrices = ParamGroup::from_regex(r"(^|\.)blocks\..*\.weight$").expect("a valid pattern");
-            adamw.init().with_group(matrices, muon.build(), None)
+#[derive(Clone)]
+pub struct StageOptimizer {
+    all: ModuleOptimizer,
+    muon: Option<(Muon, ParamGroup)>,
+}
+
+impl StageOptimizer {
+    /// Makes the optimizer of a config, without state.
+    ///
+    /// # Panics
+    /// Never: the pattern of the paths is valid.
+    pub fn new(config: &OptimizerConfig) -> Self {
+        let weight_decay = config.weight_decay as f32;
+        let [beta_1, beta_2] = config.betas.map(|beta| beta as f32);
+        let adamw = AdamWConfig::new().with_beta_1(beta_1).with_beta_2(beta_2).with_epsilon(1e-8);
+        let adamw = adamw.with_weight_decay(weight_decay).init();
+        match config.algorithm {
+            Algorithm::Adamw => Self { all: adamw, muon: None },
+            Algorithm::Muon => {
+                let matrices = ParamGroup::from_regex(r"(^|\.)blocks\..*\.weight$").expect("a valid pattern");
+                let muon = Muon::new(f64::from(weight_decay));
+                Self { all: adamw.with_group(matrices.clone(), muon.clone(), None), muon: Some((muon, matrices)) }
+            }
         }
+    }
+
+    /// Updates the parameters of a module that have gradients.
+    pub fn step<M: Module>(&mut self, rate: impl Into<ModuleLearningRate>, model: M, grads: GradientsParams) -> M {
+        let Self { all, muon } = self;
+        match muon {
+            Some((muon, matrices)) => muon.step((all, matrices), rate.into(), model, grads),
+            None => all.step(rate, model, grads),
+        }
+    }
+
+    /// Returns the state of all parameters.
+    pub fn to_record(&self) -> OptimizerRecord {
+        self.all.to_record()
+    }
+
+    /// Replaces the state of all parameters.
+    ///
+    /// # Panics
+    /// For integer tensors and for tensors without parameter ids, in Burn 0.22.
+    pub fn load_record(self, record: OptimizerRecord) -> Self {
+        Self { all: self.all.load_record(record), ..self }
     }
 }
 
@@ -116,7 +146,7 @@ mod tests {
         let device = Device::flex();
         let mut model = toy(&fixture, &device.clone().autodiff());
         let config = OptimizerConfig { betas: [0.0, 0.0], weight_decay: 0.0, ..OptimizerConfig::default() };
-        let mut optimizer = make_optimizer(&config);
+        let mut optimizer = StageOptimizer::new(&config);
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         for step in 0..2 {
             let grad = grads_a.clone().narrow(0, step, 1).squeeze_dim::<2>(0);
@@ -134,7 +164,7 @@ mod tests {
         let device = Device::flex();
         // Parameters that train live with autodiff, their gradients without.
         let mut model = toy(&fixture, &device.clone().autodiff());
-        let mut optimizer = make_optimizer(&OptimizerConfig::default());
+        let mut optimizer = StageOptimizer::new(&OptimizerConfig::default());
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         let grads_b: Tensor<2> = fixture.tensor("input.grad_b", &device);
         for (step, rate) in fixture.values("output.lr").into_iter().take(5).enumerate() {
@@ -179,7 +209,7 @@ mod tests {
         let names = ["wide", "tall", "wide"];
         let mut model = Matrices { blocks: vec![block("wide"), block("tall")], outside: block("wide") };
         let config = OptimizerConfig { algorithm: Algorithm::Muon, ..OptimizerConfig::default() };
-        let mut optimizer = make_optimizer(&config);
+        let mut optimizer = StageOptimizer::new(&config);
         for step in 0..5 {
             let of_step = |kind: &str, name: &str| {
                 let all: Tensor<3> = fixture.tensor(&format!("{kind}_{name}"), &device);

@@ -1,7 +1,7 @@
 //! One optimizer update, the same for both stages.
 
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
-use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
+use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 
@@ -15,14 +15,14 @@ use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::gradient_sum::GradientSum;
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
-use crate::step::optimizer::{clip_factor, make_optimizer, norm_on_device, scale_gradients};
+use crate::step::optimizer::{StageOptimizer, clip_factor, norm_on_device, scale_gradients};
 
 /// A model with its optimizer on an autodiff device.
 pub struct TrainState {
     /// The trained model.
     pub model: Clift,
     /// Its optimizer.
-    pub optimizer: ModuleOptimizer,
+    pub optimizer: StageOptimizer,
     /// The autodiff device.
     pub device: Device,
     /// The minimized loss.
@@ -51,7 +51,7 @@ pub struct Update {
 impl TrainState {
     /// Makes the state before the first update: mean squared error, f32, activations stored.
     pub fn new(model: Clift, optimizer: &OptimizerConfig, device: Device) -> Self {
-        let (optimizer, loss) = (make_optimizer(optimizer), Loss::default());
+        let (optimizer, loss) = (StageOptimizer::new(optimizer), Loss::default());
         Self {
             model,
             optimizer,

@@ -5,6 +5,7 @@ use std::rc::Rc;
 use clift_train::{Launched, RankPlace, Ranks, TrainError};
 
 use crate::output::verbosity::Verbosity;
+use crate::threads;
 
 /// Connects the processes of a launcher, and gives each its share of the cores. From now on only rank 0 prints.
 pub fn connect() -> Result<Rc<Ranks>, TrainError> {
@@ -13,10 +14,8 @@ pub fn connect() -> Result<Rc<Ranks>, TrainError> {
         Verbosity::Silent.choose();
     }
     let ranks = launched.connect()?;
-    if ranks.num_ranks() > 1 && std::env::var_os("RAYON_NUM_THREADS").is_none() {
-        let place = RankPlace::find(&ranks)?;
-        // Fails if the threads are there already, which then keep their number.
-        drop(rayon::ThreadPoolBuilder::new().num_threads(place.num_threads).build_global());
+    if ranks.num_ranks() > 1 {
+        threads::start(Some(RankPlace::find(&ranks)?.num_threads));
     }
     Ok(Rc::new(ranks))
 }

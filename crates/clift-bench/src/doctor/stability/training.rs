@@ -5,8 +5,8 @@ use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use clift_model::Clift;
 use clift_train::{
-    DeviceBatch, Loss, OptimizerConfig, Stage, StageBatch, TrainError, clip_global_norm, freeze, global_norm,
-    make_optimizer, render_loss, seeded_batch, seeded_model,
+    DeviceBatch, Loss, OptimizerConfig, Stage, StageBatch, StageOptimizer, TrainError, clip_global_norm, freeze,
+    global_norm, render_loss, seeded_batch, seeded_model,
 };
 
 use crate::cases::reference::{ToF64, module_in_f64, values};
@@ -37,7 +37,7 @@ const STEPS: usize = 20;
 /// Returns the losses of [`STEPS`] updates on one batch.
 fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -> Result<Vec<f64>, TrainError> {
     let config = OptimizerConfig::default();
-    let mut optimizer = make_optimizer(&config);
+    let mut optimizer = StageOptimizer::new(&config);
     let device = device.clone().autodiff();
     let mut losses = Vec::new();
     for _ in 0..STEPS {
