@@ -197,7 +197,13 @@ impl<'a> ProductKernel for BackwardTask<'a> {
                 for row in 0..rows {
                     let range = row * score_row..row * score_row + padded::<S>(count);
                     let pair = (&mut weights[range.clone()], &mut slopes[range]);
-                    score_gradients(simd, pair, sizes.scale_of_exponents(), log_sum[start + row], delta[start + row]);
+                    score_gradients::<S, O>(
+                        simd,
+                        pair,
+                        sizes.scale_of_exponents(),
+                        log_sum[start + row],
+                        delta[start + row],
+                    );
                 }
                 let size = [count, lanes_of::<O>(rows), head_width];
                 let right = |values| Right { values, step: width, panel };
@@ -247,10 +253,16 @@ fn by_key<'v, S: Simd, O: Operands>(
 
 /// Replaces a row of scores by the weights `P`, and the row of the weights' gradients by the scores' gradients.
 #[inline(always)]
-fn score_gradients<S: Simd>(simd: S, (scores, slopes): (&mut [f32], &mut [f32]), scale: f32, log_sum: f32, delta: f32) {
+fn score_gradients<S: Simd, O: Operands>(
+    simd: S,
+    (scores, slopes): (&mut [f32], &mut [f32]),
+    scale: f32,
+    log_sum: f32,
+    delta: f32,
+) {
     let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
     for (score, slope) in scores.chunks_exact_mut(S::LANES).zip(slopes.chunks_exact_mut(S::LANES)) {
-        let weight = simd.exp2(simd.mul_add(simd.read(score), factor, shift));
+        let weight = O::exp2(simd, simd.mul_add(simd.read(score), factor, shift));
         simd.write(score, weight);
         simd.write(slope, simd.mul(weight, simd.sub(simd.read(slope), delta)));
     }

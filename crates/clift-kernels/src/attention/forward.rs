@@ -103,7 +103,7 @@ impl<'a> ProductKernel for Forward<'a> {
                 for row in 0..rows {
                     let scores = &mut scores[row * score_row..][..count];
                     let factor = sizes.scale_of_exponents();
-                    let shrink = exponentials(simd, scores, factor, &mut highest[row], &mut total[row]);
+                    let shrink = exponentials::<S, O>(simd, scores, factor, &mut highest[row], &mut total[row]);
                     pack_in_place::<S, O>(simd, scores);
                     if shrink != 1.0 {
                         scale(simd, &mut sums[row * width..][..width], shrink);
@@ -133,7 +133,13 @@ impl<'a> ProductKernel for Forward<'a> {
 /// Replaces a row of scores by `2^(score * scale - highest)` with the highest scaled score so far, adds the results to
 /// `total`, and returns the factor that rescales earlier sums to the new highest score.
 #[inline(always)]
-fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut f32, total: &mut f32) -> f32 {
+fn exponentials<S: Simd, O: Operands>(
+    simd: S,
+    scores: &mut [f32],
+    scale: f32,
+    highest: &mut f32,
+    total: &mut f32,
+) -> f32 {
     let full = scores.len() / S::LANES * S::LANES;
     let mut largest = simd.splat(f32::NEG_INFINITY);
     for chunk in scores[..full].chunks_exact(S::LANES) {
@@ -146,12 +152,12 @@ fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut 
     let (factor, shift) = (simd.splat(scale), simd.splat(-raised));
     let mut sum = simd.splat(0.0);
     for chunk in scores[..full].chunks_exact_mut(S::LANES) {
-        let weight = simd.exp2(simd.mul_add(simd.read(chunk), factor, shift));
+        let weight = O::exp2(simd, simd.mul_add(simd.read(chunk), factor, shift));
         simd.write(chunk, weight);
         sum = simd.add(sum, weight);
     }
     let rest = &mut scores[full..];
-    let weight = simd.exp2(simd.mul_add(simd.read(rest), factor, shift));
+    let weight = O::exp2(simd, simd.mul_add(simd.read(rest), factor, shift));
     simd.write(rest, weight);
     *highest = raised;
     *total = *total * shrink + simd.sum(sum) + rest.iter().sum::<f32>();
