@@ -194,17 +194,9 @@ impl<'a> ProductKernel for BackwardTask<'a> {
                 let (query, grad) = (&queries[start * query_row..], &grads[start * query_row..]);
                 multiply::<S, O>(simd, size, left(query), right(keys_t), (weights, score_row), false);
                 multiply::<S, O>(simd, size, left(grad), right(values_t), (slopes, score_row), false);
-                for row in 0..rows {
-                    let range = row * score_row..row * score_row + padded::<S>(count);
-                    let pair = (&mut weights[range.clone()], &mut slopes[range]);
-                    score_gradients::<S, O>(
-                        simd,
-                        pair,
-                        sizes.scale_of_exponents(),
-                        log_sum[start + row],
-                        delta[start + row],
-                    );
-                }
+                let of_rows = (&log_sum[start..start + rows], &delta[start..start + rows]);
+                let (pair, size) = ((&mut *weights, &mut *slopes), [score_row, padded::<S>(count)]);
+                score_gradients::<S, O>(simd, pair, size, sizes.exponent_scale(), of_rows);
                 let size = [count, lanes_of::<O>(rows), head_width];
                 let right = |values| Right { values, step: width, panel };
                 let (query, grad) = (&queries_across[first_lane..], &grads_across[first_lane..]);
@@ -251,20 +243,25 @@ fn by_key<'v, S: Simd, O: Operands>(
     Left { values, row: 1, step: stride }
 }
 
-/// Replaces a row of scores by the weights `P`, and the row of the weights' gradients by the scores' gradients.
+/// Replaces rows of scores, `width` values every `stride`, by the weights `P`, and the weights' gradients by the scores'
+/// gradients. `log_sums` and `deltas` have a value per row.
 #[inline(always)]
 fn score_gradients<S: Simd, O: Operands>(
     simd: S,
     (scores, slopes): (&mut [f32], &mut [f32]),
+    [stride, width]: [usize; 2],
     scale: f32,
-    log_sum: f32,
-    delta: f32,
+    (log_sums, deltas): (&[f32], &[f32]),
 ) {
-    let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
-    for (score, slope) in scores.chunks_exact_mut(S::LANES).zip(slopes.chunks_exact_mut(S::LANES)) {
-        let weight = O::exp2(simd, simd.mul_add(simd.read(score), factor, shift));
-        simd.write(score, weight);
-        simd.write(slope, simd.mul(weight, simd.sub(simd.read(slope), delta)));
+    let rows = scores.chunks_mut(stride).zip(slopes.chunks_mut(stride));
+    for ((scores, slopes), (&log_sum, &delta)) in rows.zip(log_sums.iter().zip(deltas)) {
+        let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
+        let vectors = scores[..width].chunks_exact_mut(S::LANES).zip(slopes[..width].chunks_exact_mut(S::LANES));
+        for (score, slope) in vectors {
+            let weight = O::exp2(simd, simd.mul_add(simd.read(score), factor, shift));
+            simd.write(score, weight);
+            simd.write(slope, simd.mul(weight, simd.sub(simd.read(slope), delta)));
+        }
     }
 }
 

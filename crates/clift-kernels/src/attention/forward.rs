@@ -102,7 +102,7 @@ impl<'a> ProductKernel for Forward<'a> {
                 multiply::<S, O>(simd, [rows, inner, count], left, right, (scores, score_row), false);
                 for row in 0..rows {
                     let scores = &mut scores[row * score_row..][..count];
-                    let factor = sizes.scale_of_exponents();
+                    let factor = sizes.exponent_scale();
                     let shrink = exponentials::<S, O>(simd, scores, factor, &mut highest[row], &mut total[row]);
                     pack_in_place::<S, O>(simd, scores);
                     if shrink != 1.0 {

@@ -28,7 +28,7 @@ impl AttentionSizes {
     }
 
     /// Returns the factor of products of queries and keys in exponents of 2.
-    pub(crate) fn scale_of_exponents(&self) -> f32 {
+    pub(crate) fn exponent_scale(&self) -> f32 {
         self.scale() * std::f32::consts::LOG2_E
     }
 

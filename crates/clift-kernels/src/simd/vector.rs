@@ -111,7 +111,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
     #[inline(always)]
     fn exp2_for_bf16(self, a: Self::V) -> Self::V {
         // The cubic with the least largest relative error in -0.5..=0.5.
-        exp2_by(self, a, [0.055_008_93, 0.242_210_96, 0.693_282_93, 1.0])
+        exp2_by(self, a, [0.055_008_93, 0.242_210_96, 0.693_282_9, 1.0])
     }
 }
 

@@ -57,6 +57,7 @@ impl StageOptimizer {
     ///
     /// # Panics
     /// For integer tensors and for tensors without parameter ids, in Burn 0.22.
+    #[must_use]
     pub fn load_record(self, record: OptimizerRecord) -> Self {
         Self { all: self.all.load_record(record), ..self }
     }
