@@ -4,7 +4,7 @@ use clift_model::DeviceName;
 
 use crate::system::machine::proc_field;
 
-/// Lets the process keep freed memory, for its next allocation: fresh pages, which the system fills with zeros, take 5 to 9 %
+/// Lets the process keep freed memory, for its next allocation: fresh pages, which the system fills with zeros, take 5 to 8 %
 /// of a training step.
 pub fn keep_freed_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
