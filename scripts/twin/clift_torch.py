@@ -134,7 +134,8 @@ def token_matrices(
     Channel `j*E/8 + k` of a head is coordinate j of the k-th 4-vector, on which the
     world-to-camera matrix acts (`prope`: times the intrinsics in units of the image
     size, principal point relative to the centre). Channels `E/2 + p` and `3E/4 + p`
-    are a pair that turns by the angle p: E/8 of them by the row, E/8 by the column.
+    are a pair that turns by the angle p: E/8 of them by the row, E/8 by the column of
+    the patch's centre, in patches from the principal point.
     """
     rows, columns, count = height // PATCH_SIZE, width // PATCH_SIZE, head_dim // 8
     batch, views = c2w.shape[:2]
@@ -152,12 +153,12 @@ def token_matrices(
     for row in range(rows):
         for column in range(columns):
             for p in range(2 * count):
-                place, index = (row, p) if p < count else (column, p - count)
-                angle = place * 100.0 ** (-index / count)
+                centre, axis, index = (row + 0.5, 3, p) if p < count else (column + 0.5, 2, p - count)
+                angle = (centre - intrinsics[..., axis] / PATCH_SIZE) * 100.0 ** (-index / count)
                 a, b = 4 * count + p, 6 * count + p
-                rho[:, :, row, column, a, a] = rho[:, :, row, column, b, b] = math.cos(angle)
-                rho[:, :, row, column, a, b] = -math.sin(angle)
-                rho[:, :, row, column, b, a] = math.sin(angle)
+                rho[:, :, row, column, a, a] = rho[:, :, row, column, b, b] = angle.cos()
+                rho[:, :, row, column, a, b] = -angle.sin()
+                rho[:, :, row, column, b, a] = angle.sin()
     return rho.flatten(1, 3)
 
 

@@ -60,6 +60,7 @@ pub use ops::precision::Precision;
 // Images and cameras
 pub use views::camera::ViewCamera;
 pub use views::patch::{patchify, unpatchify};
+pub use views::patch_grids::PatchGrids;
 pub use views::rays::plucker;
 pub use views::upload::{Cameras, Views, upload_images};
 // Tokens: counts, clusters, selection

@@ -175,14 +175,14 @@ fn paths_render_to_frames_and_animation_by_count() {
     for (out, size, flags, num_render_tokens) in [
         ("all", (16, 16), "--path interpolate", 8),
         ("some", (16, 16), "--path interpolate --render 3", 3),
-        ("global", (16, 16), "--path orbit --render 1/2 --selection global", 4),
+        ("global", (16, 16), "--path orbit --render 1/2 --selection global --patch-grids 4", 4),
         ("large", (48, 32), "--path orbit --size 48x32", 8),
         ("in-time", (16, 16), "--path orbit --budget-ms 60000", 8),
     ] {
         let ran = place.clift(&format!("render DIR/room.clift --out DIR/{out} {flags} --frames 10 --fps 12")).ok();
         let ran =
             ran.prints(&format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1));
-        let warning = "warning: the network was trained on images of 16 x 16; frames of 48 x 32 show its patches";
+        let warning = "warning: the network was trained on images of 16 x 16; frames of 48 x 32 are smooth";
         assert_eq!(ran.stderr.contains(warning), out == "large", "{}", ran.stderr);
         let mut expected: Vec<String> = (0..10).map(|frame| format!("frame-{frame:05}.png")).collect();
         expected.insert(0, "animation.png".into());
@@ -199,6 +199,7 @@ fn paths_render_to_frames_and_animation_by_count() {
             let ids: Vec<u64> = list(frame).iter().map(|id| id.as_u64().expect("an index")).collect();
             assert!(ids.len() == num_render_tokens && ids.is_sorted_by(|a, b| a < b) && ids.iter().all(|id| *id < 8));
         }
+        assert_eq!(report["patch_grids"], if out == "global" { 4 } else { 1 });
         assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
         assert_eq!(number(&report, "select_s") > 0.0, num_render_tokens < 8, "{report}");
         let selection = match out {

@@ -251,6 +251,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
     let num_targets = eval.num_targets;
     let scene = scene_with_all_tokens(config, eval.num_context, num_targets)?;
+    let grids = config.model.drawn_patches(config.data.height, config.data.width)?;
     let counts = config.eval_storage().iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
     // Multiply-accumulates of the encoder, and of all that reads its tokens.
@@ -258,10 +259,10 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
         let mut rest = 0.0;
         for &count in &counts {
             let scene = scene_with_stored_tokens(scene, count);
-            let rendered = sweep
-                .token_counts(count)
-                .into_iter()
-                .map(|num_render_tokens| part_macs(model, Part::Renderer, &SceneSizes { num_render_tokens, ..scene }));
+            let drawn = sweep.token_counts(count).into_iter().flat_map(|num_render_tokens| {
+                grids.iter().map(move |&num_patches| SceneSizes { num_render_tokens, num_patches, ..scene })
+            });
+            let rendered = drawn.map(|scene| part_macs(model, Part::Renderer, &scene));
             rest += part_macs(model, Part::Condenser, &scene) + rendered.sum::<f64>();
         }
         (part_macs(model, Part::Encoder, &scene), rest)

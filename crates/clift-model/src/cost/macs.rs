@@ -1,5 +1,6 @@
 //! Multiply-accumulates of the networks, and conventions to count them.
 
+use std::iter::Sum;
 use std::str::FromStr;
 
 use strum::{Display, IntoStaticStr, VariantArray};
@@ -74,6 +75,16 @@ impl Macs {
     }
 }
 
+impl Sum for Macs {
+    fn sum<I: Iterator<Item = Self>>(parts: I) -> Self {
+        parts.fold(Self::default(), |sum, macs| Self {
+            linear: sum.linear + macs.linear,
+            attention: sum.attention + macs.attention,
+            normalized: sum.normalized + macs.normalized,
+        })
+    }
+}
+
 impl Layer {
     fn macs(&self, sizes: &SceneSizes) -> Macs {
         if self.rows == [Rows::GatheringTokens] && sizes.num_rows(&[Rows::Members]) == 0 {
@@ -97,23 +108,24 @@ impl ModelConfig {
     /// Returns the cost of one network for a scene.
     pub fn macs(&self, part: Part, sizes: &SceneSizes) -> Macs {
         let layers = self.layers();
-        let macs = layers.iter().filter(|layer| layer.part == part).map(|layer| layer.macs(sizes));
-        macs.fold(Macs::default(), |sum, macs| Macs {
-            linear: sum.linear + macs.linear,
-            attention: sum.attention + macs.attention,
-            normalized: sum.normalized + macs.normalized,
-        })
+        layers.iter().filter(|layer| layer.part == part).map(|layer| layer.macs(sizes)).sum()
     }
 
-    /// Returns the cost of rendering one view from `num_render_tokens` tokens, with the projection of keys and values.
+    /// Returns the cost of rendering one view from `num_render_tokens` tokens: all of its patch grids, and the projection of
+    /// keys and values.
     ///
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn render_macs(&self, height: usize, width: usize, num_render_tokens: usize) -> Result<Macs, ModelError> {
-        let num_patches = self.num_patches(1, height, width)?;
-        let mut macs = self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
+        let of_patches = |num_patches| self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
+        let grids = self.drawn_patches(height, width)?;
+        let mut macs: Macs = grids.iter().map(|&num_patches| of_patches(num_patches)).sum();
+        if !self.has_latents() {
+            // Grids share the keys and values of the tokens.
+            macs.linear -= (grids.len() - 1) as u64 * of_patches(0).linear;
+        }
         // The paper counts one norm more than the network has.
-        macs.normalized += (num_patches * self.dim) as u64;
+        macs.normalized += (grids.iter().sum::<usize>() * self.dim) as u64;
         Ok(macs)
     }
 
@@ -141,6 +153,7 @@ mod tests {
     use crate::ops::mac_counter;
     use crate::testing::{random, small_configs};
     use crate::tokens::clusters::{Clusters, SceneClusters};
+    use crate::views::patch_grids::PatchGrids;
     use crate::views::upload::{Cameras, Views};
 
     #[test]
@@ -187,8 +200,15 @@ mod tests {
                     let expected = config.render_macs(height, width, count).unwrap();
                     model.renderer.forward(tokens.clone(), &cameras(1));
                     assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "renderer, {count} tokens");
-                    model.renderer.render_cached(&model.renderer.project_tokens(&tokens), &cameras(1));
-                    assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "cached, {count} tokens");
+                    for patch_grids in [PatchGrids::One, PatchGrids::Two, PatchGrids::Four] {
+                        let config = ModelConfig { patch_grids, ..config.clone() };
+                        let expected = config.render_macs(height, width, count).unwrap();
+                        let mut renderer = model.renderer.clone();
+                        renderer.set_patch_grids(patch_grids);
+                        renderer.render(tokens.clone(), &cameras(1));
+                        let counted = mac_counter::take();
+                        assert_eq!(counted, (expected.linear, expected.attention), "{patch_grids:?}, {count} tokens");
+                    }
 
                     model.renderer.forward(tokens, &cameras(3));
                     let sizes = SceneSizes::new(count, 3, config.num_patches(1, height, width).unwrap());

@@ -2,7 +2,8 @@
 //! arXiv 2507.10496).
 //!
 //! Every token has a block-diagonal matrix `rho`, made of the world-to-camera matrix `g` of its view and of rotations by
-//! the row and the column of its patch. Attention runs on `rho_i^T q_i`, `rho_j^-1 k_j` and `rho_j^-1 v_j`, and `rho_i` is
+//! the place of its patch: rows and columns of patches from the principal point, so that a window of an image has the
+//! transforms of the whole. Attention runs on `rho_i^T q_i`, `rho_j^-1 k_j` and `rho_j^-1 v_j`, and `rho_i` is
 //! applied to its output. A score then depends on `g_i g_j^-1` alone, the relative pose of two views.
 // B scenes, V views, n patches of a view, N = V n tokens, E width of a head, L values of a transform
 
@@ -48,30 +49,31 @@ impl TransformMaker {
         };
         let [batch, views] = cameras.dims();
         let [rows, columns] = [cameras.height, cameras.width].map(|side| side / self.patch_size);
-        let device = matrices.device();
-        let angles = self.angles(rows, columns);
-        let angles = TensorData::new(angles, [1, 1, rows * columns, self.head_width / 2]);
-        let angles = Tensor::<4>::from_data(angles, (&device, matrices.dtype()));
+        let angles = self.angles(cameras, rows, columns);
         let matrices = matrices.reshape([batch, views, 1, 32]).expand([batch, views, rows * columns, 32]);
-        let angles = angles.expand([batch, views, rows * columns, self.head_width / 2]);
         let len = 32 + self.head_width / 2;
         Some(TokenTransforms(Tensor::cat(vec![matrices, angles], 3).reshape([batch, views * rows * columns, len])))
     }
 
-    /// Returns cosines, then sines of the angles of every patch: half of them by its row, half by its column.
-    fn angles(&self, rows: usize, columns: usize) -> Vec<f64> {
+    /// Computes cosines, then sines of the angles of every patch: half of them by its row, half by its column, in patches
+    /// from the principal point to the center of the patch.
+    fn angles(&self, cameras: &Cameras, rows: usize, columns: usize) -> Tensor<4> {
+        let [batch, views] = cameras.dims();
         let count = self.head_width / 8;
-        let frequency = |i: usize| LONGEST.powf(-(i as f64) / count as f64);
-        let mut values = Vec::with_capacity(rows * columns * 4 * count);
-        for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
-            let angles: Vec<f64> = [row, column]
-                .into_iter()
-                .flat_map(|place| (0..count).map(move |i| place as f64 * frequency(i)))
-                .collect();
-            values.extend(angles.iter().map(|angle| angle.cos()));
-            values.extend(angles.iter().map(|angle| angle.sin()));
-        }
-        values
+        let options = (&cameras.c2w.device(), cameras.c2w.dtype());
+        let frequencies: Vec<f64> = (0..count).map(|i| LONGEST.powf(-(i as f64) / count as f64)).collect();
+        let frequencies = Tensor::<5>::from_data(TensorData::new(frequencies, [1, 1, 1, 1, count]), options);
+        let side = self.patch_size as f64;
+        let angles = |principal_point: usize, num_patches: usize, shape: [usize; 5]| {
+            let centers: Vec<f64> = (0..num_patches).map(|patch| patch as f64 + 0.5).collect();
+            let centers = Tensor::<5>::from_data(TensorData::new(centers, shape), options);
+            let point = cameras.intrinsics.clone().narrow(2, principal_point, 1).reshape([batch, views, 1, 1, 1]);
+            let angles = (centers - point.div_scalar(side)) * frequencies.clone();
+            angles.expand([batch, views, rows, columns, count])
+        };
+        let angles = vec![angles(3, rows, [1, 1, rows, 1, 1]), angles(2, columns, [1, 1, 1, columns, 1])];
+        let angles = Tensor::cat(angles, 4);
+        Tensor::cat(vec![angles.clone().cos(), angles.sin()], 4).reshape([batch, views, rows * columns, 4 * count])
     }
 }
 

@@ -76,7 +76,7 @@ impl SceneModel for Clift {
     }
 
     fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
-        self.renderer.forward(tokens, targets)
+        self.renderer.render(tokens, targets)
     }
 
     fn supports_selection(&self) -> bool {

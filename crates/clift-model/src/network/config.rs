@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
 use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant};
+use crate::views::patch_grids::PatchGrids;
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are those of the network's paper, with six blocks each
 /// in encoder and renderer.
@@ -33,6 +34,10 @@ pub struct ModelConfig {
     /// How attention knows the cameras.
     #[serde(skip_serializing_if = "is_default")]
     pub camera_encoding: CameraEncoding,
+    /// Times that an image is drawn, with patches shifted by half of their side, and averaged: 1, 2 or 4. Training draws an
+    /// image once.
+    #[serde(skip_serializing_if = "is_default")]
+    pub patch_grids: PatchGrids,
     /// The condenser of stage 2.
     pub condenser: CondenserConfig,
 }
@@ -82,6 +87,7 @@ struct ModelSection {
     num_renderer_blocks: Option<usize>,
     patch_size: Option<usize>,
     camera_encoding: CameraEncoding,
+    patch_grids: PatchGrids,
     condenser: CondenserSection,
 }
 
@@ -113,6 +119,7 @@ impl From<ModelSection> for ModelConfig {
             num_renderer_blocks: section.num_renderer_blocks.unwrap_or(6),
             patch_size: section.patch_size.unwrap_or(8),
             camera_encoding: section.camera_encoding,
+            patch_grids: section.patch_grids,
             condenser: CondenserConfig {
                 num_blocks: section.condenser.num_blocks.unwrap_or(defaults.num_blocks),
                 residual: section.condenser.residual.unwrap_or(defaults.residual),
@@ -147,6 +154,16 @@ impl ModelConfig {
             return Err(ModelError::NotDivisible { width, height, patch_size });
         }
         Ok(num_views * (height / patch_size) * (width / patch_size))
+    }
+
+    /// Returns the number of patches of every grid that an image of `width` by `height` pixels is the mean of.
+    ///
+    /// # Errors
+    /// As [`num_patches`](Self::num_patches).
+    pub fn drawn_patches(&self, height: usize, width: usize) -> Result<Vec<usize>, ModelError> {
+        self.num_patches(1, height, width)?;
+        let patches = self.patch_grids.patches([height, width].map(|side| side / self.patch_size));
+        Ok(patches.map(|[rows, columns]| rows * columns).collect())
     }
 
     /// Returns the number of encoder tokens of `num_views` context views: one per patch, or the latents of LVSM.
@@ -244,6 +261,13 @@ impl ModelConfig {
                     format!("needs heads of a multiple of 8 channels, not {}: change model.num_heads", dim / num_heads);
                 return bad(key, self.camera_encoding.to_string(), fix);
             }
+        }
+        if self.camera_encoding == CameraEncoding::Prope && self.patch_grids != PatchGrids::One {
+            let fix =
+                "model.camera_encoding = \"prope\" measures in units of the image size, which other grids change: \
+                       write 1"
+                    .to_owned();
+            return bad("model.patch_grids", usize::from(self.patch_grids).to_string(), fix);
         }
         if self.has_latents() {
             let fix = "of LVSM, write \"paper\" or \"released-re10k\", its network in CLiFT's release".to_owned();
@@ -343,6 +367,19 @@ mod tests {
             assert!(message(text).starts_with(expected), "{}", message(text));
         }
         assert!(!serde_json::to_string(&ModelConfig::default()).expect("JSON").contains("latents"), "former files");
+    }
+
+    #[test]
+    fn images_are_drawn_on_one_two_or_four_patch_grids() {
+        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text);
+        let gta = r#"{"camera_encoding": "gta", "patch_grids": 4}"#;
+        let config = parse(gta).expect("a model section");
+        config.validate().expect("valid");
+        assert_eq!(config.drawn_patches(16, 24).expect("divides"), [6, 8, 9, 12]);
+        let prope = parse(&gta.replace("gta", "prope")).expect("a model section").validate().unwrap_err().to_string();
+        assert!(prope.starts_with("`model.patch_grids` = 4: model.camera_encoding = \"prope\""), "{prope}");
+        let three = parse(&gta.replace('4', "3")).unwrap_err().to_string();
+        assert!(three.contains("write 1, 2 or 4"), "{three}");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use crate::network::tokens::Tokens;
 pub struct KeyValueCache {
     /// One tensor per block, `[batch, num_render_tokens, 2 dim]`.
     pub(crate) blocks: Vec<Tensor<3>>,
-    pub(crate) tokens: Option<Tokens>,
+    pub(crate) tokens: Option<RenderTokens>,
     pub(crate) num_render_tokens: usize,
 }
 
@@ -25,7 +25,7 @@ impl KeyValueCache {
         };
         let indices = upload_ids(tokens, &first.device());
         let blocks = self.blocks.iter().map(|key_value| key_value.clone().select(1, indices.clone())).collect();
-        Self { blocks, tokens: self.tokens.as_ref().map(|all| all.select(tokens)), num_render_tokens: tokens.len() }
+        Self { blocks, tokens: None, num_render_tokens: tokens.len() }
     }
 }
 
@@ -83,6 +83,11 @@ impl RenderTokens {
     /// Returns the values of the tokens that keys and values are projected from.
     pub fn values(&self) -> &Tensor<3> {
         &self.tokens.values
+    }
+
+    /// Returns the number of tokens of every set.
+    pub(crate) fn num_render_tokens(&self) -> usize {
+        self.rows.as_ref().map_or(self.tokens.dims()[1], |rows| rows.dims()[1])
     }
 
     /// Returns the tokens of every set, `[groups, num_render_tokens, dim]`.

@@ -12,9 +12,9 @@ use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::joint_decoder::JointDecoder;
 use crate::network::render_tokens::{KeyValueCache, RenderTokens};
-use crate::network::tokens::Tokens;
 use crate::ops::linear::{linear_in_f32, norm_linear};
 use crate::views::patch::{patchify, unpatchify};
+use crate::views::patch_grids::PatchGrids;
 use crate::views::rays::plucker;
 use crate::views::upload::Cameras;
 
@@ -31,6 +31,8 @@ pub struct Renderer {
     #[module(skip)]
     patch_size: usize,
     #[module(skip)]
+    patch_grids: PatchGrids,
+    #[module(skip)]
     transforms: TransformMaker,
 }
 
@@ -45,6 +47,7 @@ impl Renderer {
             output_norm: init.layer_norm(config.dim),
             to_pixels: init.block(None).linear(config.dim, config.rgb_patch_len()),
             patch_size: config.patch_size,
+            patch_grids: config.patch_grids,
             transforms: TransformMaker::new(config),
         }
     }
@@ -59,11 +62,24 @@ impl Renderer {
         self.patch_size
     }
 
-    /// Renders target views from tokens. Views are independent of each other.
+    /// Replaces the number of patch grids, that of the config at first.
+    pub fn set_patch_grids(&mut self, patch_grids: PatchGrids) {
+        self.patch_grids = patch_grids;
+    }
+
+    /// Renders target views from tokens, each the mean of its patch grids. Views are independent of each other.
     ///
     /// # Shapes
     /// - `tokens`: one set per scene, shared by its target views, or one set per target view
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
+    pub fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
+        self.render_cached(&self.project_tokens(tokens), targets)
+    }
+
+    /// Draws target views once, on one patch grid, as in training.
+    ///
+    /// # Shapes
+    /// - as [`render`](Self::render)
     pub fn forward(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         let tokens = tokens.into();
         let transforms = self.transforms(targets);
@@ -78,22 +94,27 @@ impl Renderer {
         self.transforms.of_views(targets).map(|transforms| transforms.regroup(batch * views))
     }
 
-    /// Projects a scene's tokens to keys and values in every block, for rendering many views of the scene.
+    /// Projects tokens to keys and values in every block, for rendering many views.
     ///
     /// # Shapes
-    /// - `tokens`: `[batch, num_render_tokens, dim]`
-    pub fn project_tokens(&self, tokens: &Tokens) -> KeyValueCache {
-        let blocks = self.blocks.iter().map(|block| block.project_tokens(tokens.clone())).collect();
-        let tokens_of_joint = self.joint.is_some().then(|| tokens.clone());
-        KeyValueCache { blocks, tokens: tokens_of_joint, num_render_tokens: tokens.dims()[1] }
+    /// - `tokens`: as [`render`](Self::render)
+    pub fn project_tokens(&self, tokens: impl Into<RenderTokens>) -> KeyValueCache {
+        let tokens = tokens.into();
+        let blocks = self.blocks.iter().map(|block| tokens.project(block)).collect();
+        let num_render_tokens = tokens.num_render_tokens();
+        KeyValueCache { blocks, tokens: self.joint.is_some().then_some(tokens), num_render_tokens }
     }
 
-    /// Renders target views as [`forward`](Self::forward) does, from the keys and values of
+    /// Renders target views as [`render`](Self::render) does, from the keys and values of
     /// [`project_tokens`](Self::project_tokens).
     ///
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
+        self.patch_grids.mean(self.patch_size, targets, |targets| self.forward_cached(cache, targets))
+    }
+
+    fn forward_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
         if let Some(tokens) = &cache.tokens {
             return self.forward(tokens.clone(), targets);
         }

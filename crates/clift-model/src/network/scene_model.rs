@@ -41,7 +41,7 @@ pub trait SceneModel {
     /// - returns `[batch, num_storage_tokens, dim]`
     fn compress(&self, tokens: Tokens, clusters: &ClusterIndex) -> Tokens;
 
-    /// Renders target views.
+    /// Renders target views, each the mean of its patch grids.
     ///
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`

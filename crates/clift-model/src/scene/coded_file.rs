@@ -21,6 +21,7 @@ use std::path::Path;
 use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
 use crate::files::replace;
+use crate::network::config::ModelConfig;
 use crate::scene::header::{Fields, Refusal, refusal, write_fields};
 use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, SceneNormalization};
 use crate::scene::write::{WRITABLE_FOLDER, check_output_path};
@@ -38,7 +39,8 @@ impl Scene {
     /// # Errors
     /// [`ModelError::BadConfig`] for a codec of another model, or a step that is not positive or too small.
     pub fn coded_bytes(&self, codec: &TokenCodec, step: f32) -> Result<Vec<u8>, ModelError> {
-        if codec.renderer_hash != self.renderer_hash || codec.kind != self.kind || codec.model != self.model {
+        let is_same_model = codec.model == ModelConfig { patch_grids: codec.model.patch_grids, ..self.model.clone() };
+        if codec.renderer_hash != self.renderer_hash || codec.kind != self.kind || !is_same_model {
             let (value, fix) = (codec.hash.clone(), "the codec is of another model; fit it with `clift codec`".into());
             return Err(ModelError::BadConfig { key: "codec", value, fix });
         }

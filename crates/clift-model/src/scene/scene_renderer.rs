@@ -15,6 +15,8 @@ use crate::scene::scene::Scene;
 use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
 use crate::views::camera::ViewCamera;
+use crate::views::interleave::interleaved;
+use crate::views::patch_grids::PatchGrids;
 use crate::views::upload::Cameras;
 use crate::weights::hash::{renderer_hash, weights_hash};
 use crate::weights::model_path::check_heads;
@@ -69,6 +71,8 @@ pub struct SceneRenderer {
     /// Keys and values of all storage tokens.
     cache: KeyValueCache,
     selector: Selector,
+    /// Rows of the images that the network was trained on.
+    trained_height: usize,
     device: Device,
 }
 
@@ -85,7 +89,8 @@ impl SceneRenderer {
         let transforms = transforms.map(|transforms| transforms.select(&scene.token_ids));
         let tokens = Tokens { values, transforms };
         let selector = Selector::new(rules, &scene.token_rays())?;
-        Ok(Self { cache: renderer.project_tokens(&tokens), renderer, selector, device: device.clone() })
+        let cache = renderer.project_tokens(tokens);
+        Ok(Self { renderer, cache, selector, trained_height: scene.height, device: device.clone() })
     }
 
     /// Returns the number of the scene's tokens.
@@ -104,13 +109,19 @@ impl SceneRenderer {
         self.selector.reset();
     }
 
+    /// Replaces the number of patch grids of a frame, the model's at first.
+    pub fn set_patch_grids(&mut self, patch_grids: PatchGrids) {
+        self.renderer.set_patch_grids(patch_grids);
+    }
+
     /// Replaces the rules of token selection and resets it.
     pub fn set_rules(&mut self, rules: SelectionRules) {
         self.selector.set_rules(rules);
     }
 
     /// Renders the next frames of a path, each from its own selection of `num_render_tokens` tokens, or from all tokens if
-    /// the scene has no more. Frames of all tokens are rendered [`Self::frames_per_call`] at a time.
+    /// the scene has no more. Frames of all tokens are rendered [`Self::frames_per_call`] at a time. Frames larger than the
+    /// context views are interleaved from several of about their size: smooth, but without more detail.
     ///
     /// # Errors
     /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, and for
@@ -159,10 +170,10 @@ impl SceneRenderer {
     ) -> Result<Vec<RenderedView>, ModelError> {
         let started = Instant::now();
         let cameras = Cameras::of_views(views, height, width, &self.device)?;
-        let images = match &selected {
-            None => self.renderer.render_cached(&self.cache, &cameras),
-            Some(selected) => self.renderer.render_cached(&self.cache.select(selected), &cameras),
-        };
+        let some = selected.as_ref().map(|selected| self.cache.select(selected));
+        let cache = some.as_ref().unwrap_or(&self.cache);
+        let draw = |cameras: &Cameras| self.renderer.render_cached(cache, cameras);
+        let images = interleaved(self.trained_height, self.renderer.patch_size(), &cameras, draw);
         let images = images.into_data().convert::<f32>();
         let pixels = images.try_to_vec::<f32>().map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
         let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
@@ -255,6 +266,30 @@ mod tests {
             }
             for preset in SelectionPreset::ALL {
                 assert_equals_single_frames(&Device::flex(), &config, preset, 5, 0.0);
+            }
+        }
+    }
+
+    #[test]
+    fn every_second_pixel_of_a_frame_of_twice_the_size_is_a_frame_of_the_trained_size() {
+        let device = Device::flex();
+        let config = ModelConfig { patch_grids: PatchGrids::Four, ..encoded(CameraEncoding::Gta) };
+        let renderer = Clift::new(&config, 3, &device).renderer;
+        let scene = whole_scene(&renderer, &config);
+        let mut scene_renderer =
+            SceneRenderer::new(&scene, renderer, SelectionPreset::default().rules(), &device).unwrap();
+        let [large, small] = [camera(0.1, 0.2).resized([16, 24], [32, 48]), camera(0.1, 0.2)];
+        let large = scene_renderer.render(&[large], 32, 48, 12).unwrap().remove(0).pixels;
+        for (row, column) in [(0, 0), (1, 0), (1, 1)] {
+            // Pixel (0, 0) of the large frame is a quarter of a small pixel above and left of the small one's center.
+            let [fx, fy, cx, cy] = small.intrinsics;
+            let shift = |phase: usize| 0.25 - 0.5 * phase as f64;
+            let view = ViewCamera { intrinsics: [fx, fy, cx + shift(column), cy + shift(row)], ..small };
+            let alone = scene_renderer.render(&[view], 16, 24, 12).unwrap().remove(0).pixels;
+            for (i, expected) in alone.as_chunks::<3>().0.iter().enumerate() {
+                let at = 3 * ((2 * (i / 24) + row) * 48 + 2 * (i % 24) + column);
+                let error = large[at..at + 3].iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(error < 1e-5, "{error} at pixel {i} of phase {row}, {column}");
             }
         }
     }

@@ -48,5 +48,5 @@ pub fn render_loss(
 ) -> Result<LossParts, TrainError> {
     let lift = model.encode(&device_batch.context); // [B, N, D]
     let tokens = selection.apply(&model.condenser, lift)?;
-    Ok(loss.of(model.render(tokens, &device_batch.targets), device_batch.target_images.clone()))
+    Ok(loss.of(model.renderer.forward(tokens, &device_batch.targets), device_batch.target_images.clone()))
 }

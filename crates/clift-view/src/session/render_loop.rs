@@ -7,7 +7,7 @@ use std::time::Instant;
 use burn::tensor::Device;
 use clift_data::{RgbImage, encode_jpeg, encode_png};
 use clift_eval::{Canvas, psnr};
-use clift_model::{DeviceName, SceneRenderer, SelectionPreset};
+use clift_model::{DeviceName, PatchGrids, SceneRenderer, SelectionPreset};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{Comparison, Frame, Reply};
@@ -107,6 +107,8 @@ impl RenderLoop {
             // The picture at rest depends on the camera alone, like the first frame of `clift render`.
             renderer.reset();
         }
+        // One grid of patches is enough while the camera moves.
+        renderer.set_patch_grids(if request.rest { scene.scene.model.patch_grids } else { PatchGrids::One });
         let [width, height] = scene.sizes[size];
         let _precision = request.precision.scope();
         let view = renderer.render(&[request.camera([width, height])], height, width, tokens)?.remove(0);

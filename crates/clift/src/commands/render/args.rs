@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::builder::RangedU64ValueParser;
-use clift_model::{DeviceName, Precision, SelectionPreset, TokenCount};
+use clift_model::{DeviceName, PatchGrids, Precision, SelectionPreset, TokenCount};
 
 use crate::commands::args::parse::{parse_budget_ms, parse_size, parse_video};
 
@@ -36,6 +36,9 @@ pub struct RenderArgs {
     /// Select rendered tokens by this rule: paper, global or scaled
     #[arg(long, value_name = "PRESET", default_value = "scaled")]
     pub selection: SelectionPreset,
+    /// Average 1, 2 or 4 drawings with shifted patches [default: the model's]
+    #[arg(long, value_name = "COUNT")]
+    pub patch_grids: Option<PatchGrids>,
     /// Width and height of a frame in pixels, multiples of the patch [default: context]
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<[usize; 2]>,

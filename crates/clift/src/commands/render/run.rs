@@ -1,5 +1,6 @@
 //! `clift render`.
 
+use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -8,8 +9,8 @@ use clift_data::{
 };
 use clift_eval::available_bytes;
 use clift_model::{
-    DeviceName, MAX_SIDE_PX, ModelError, ModelPath, RenderBudget, Scene, SceneRenderer, ViewCamera, frames_per_call,
-    load_renderer, render_bytes,
+    DeviceName, MAX_SIDE_PX, ModelError, ModelPath, PatchGrids, RenderBudget, Scene, SceneRenderer, ViewCamera,
+    frames_per_call, load_renderer, render_bytes,
 };
 use serde::Serialize;
 
@@ -31,6 +32,8 @@ struct Report {
     path: String,
     /// Rule of token selection; `null` if every frame uses all tokens.
     selection: Option<&'static str>,
+    /// Patch grids that each frame is the mean of.
+    patch_grids: PatchGrids,
     device: &'static str,
     height: usize,
     width: usize,
@@ -50,11 +53,15 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
     check_size(&scene, [width, height], args.render.is_some(), device)?;
-    if [width, height] != [scene.width, scene.height] {
+    let effect = match height.cmp(&scene.height) {
+        Ordering::Less => Some("lose quality"),
+        Ordering::Equal => None,
+        Ordering::Greater => Some("are smooth, but show no more detail"),
+    };
+    if let Some(effect) = effect {
+        let trained = format!("{} x {}", scene.width, scene.height);
         print_note(&format!(
-            "warning: the network was trained on images of {} x {}; frames of {width} x {height} show its patches as a \
-             grid, or the picture several times",
-            scene.width, scene.height
+            "warning: the network was trained on images of {trained}; frames of {width} x {height} {effect}"
         ));
     }
     frames::check_out(&args.out, args.force)?;
@@ -67,8 +74,10 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let opened = device.open()?;
     args.precision.check("--precision", &opened)?;
     let _precision = args.precision.scope();
+    let patch_grids = args.patch_grids.unwrap_or(scene.model.patch_grids);
     let network = load_renderer(&scene, &weights, &opened)?;
     let mut renderer = SceneRenderer::new(&scene, network, args.selection.rules(), &opened)?;
+    renderer.set_patch_grids(patch_grids);
     let (num_render_tokens, calibration) = token_count(&scene, args, &mut renderer, &views[0], height, width)?;
     let creating = || format!("creating {}", args.out.display());
     let files = StagedDir::new(&args.out).with_context(creating)?;
@@ -79,6 +88,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         scene: scene.key.clone(),
         path: args.path.to_string(),
         selection: (num_render_tokens < scene.num_tokens()).then(|| args.selection.name()),
+        patch_grids,
         device: device.as_str(),
         height,
         width,
