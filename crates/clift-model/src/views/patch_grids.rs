@@ -25,7 +25,7 @@ pub enum PatchGrids {
 
 impl From<PatchGrids> for usize {
     fn from(grids: PatchGrids) -> Self {
-        grids.shares().len()
+        grids.half_shifts().len()
     }
 }
 
@@ -50,7 +50,7 @@ impl std::str::FromStr for PatchGrids {
 
 impl PatchGrids {
     /// Whether each grid is shifted by half a patch, by row and by column.
-    const fn shares(self) -> &'static [[usize; 2]] {
+    const fn half_shifts(self) -> &'static [[usize; 2]] {
         match self {
             Self::One => &[[0, 0]],
             Self::Two => &[[0, 0], [1, 1]],
@@ -60,7 +60,7 @@ impl PatchGrids {
 
     /// Returns the number of patches of every grid of an image, `[rows, columns]`: a shifted grid has one more.
     pub(crate) fn patches(self, [rows, columns]: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
-        self.shares().iter().map(move |[down, right]| [rows + down, columns + right])
+        self.half_shifts().iter().map(move |[down, right]| [rows + down, columns + right])
     }
 
     /// Returns the mean of the images that `draw` returns for every grid. A pixel of an image counts by its distance from
@@ -70,7 +70,8 @@ impl PatchGrids {
     /// - `draw`: of cameras of any size, `[batch, views, height, width, 3]`
     /// - returns `[batch, views, height, width, 3]` of the size of `targets`
     pub(crate) fn mean(self, patch_size: usize, targets: &Cameras, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
-        let shifts: Vec<[usize; 2]> = self.shares().iter().map(|share| share.map(|s| s * (patch_size / 2))).collect();
+        let shifts: Vec<[usize; 2]> =
+            self.half_shifts().iter().map(|halves| halves.map(|half| half * (patch_size / 2))).collect();
         let [first, rest @ ..] = &shifts[..] else { unreachable!("every variant has a grid") };
         if rest.is_empty() || patch_size == 1 {
             return draw(targets);
