@@ -118,7 +118,7 @@ pub use codec::transform::{Moments, Transform};
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frames_per_call, load_renderer};
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, drawn_images, frames_per_call, load_renderer};
 pub use scene::token_coding::{CodedLoss, TokenCoding};
 pub use scene::token_format::TokenFormat;
 pub use scene::write::check_output_path;

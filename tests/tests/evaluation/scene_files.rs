@@ -182,7 +182,7 @@ fn paths_render_to_frames_and_animation_by_count() {
         let ran = place.clift(&format!("render DIR/room.clift --out DIR/{out} {flags} --frames 10 --fps 12")).ok();
         let ran =
             ran.prints(&format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1));
-        let warning = "warning: the network was trained on images of 16 x 16; frames of 48 x 32 are smooth";
+        let warning = "warning: the network was trained on images of 16 x 16; frames of 48 x 32 show no more detail";
         assert_eq!(ran.stderr.contains(warning), out == "large", "{}", ran.stderr);
         let mut expected: Vec<String> = (0..10).map(|frame| format!("frame-{frame:05}.png")).collect();
         expected.insert(0, "animation.png".into());

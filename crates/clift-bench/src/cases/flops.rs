@@ -1,7 +1,7 @@
 //! Floating-point operations of a case.
 
 use clift_data::DataConfig;
-use clift_model::{FlopConvention, Macs};
+use clift_model::{FlopConvention, Macs, ModelConfig, PatchGrids};
 use clift_train::TrainError;
 
 use crate::cases::case::BenchCase;
@@ -17,7 +17,9 @@ pub fn flops(case: BenchCase, context: &BenchContext) -> Result<Option<f64>, Tra
     let count = |macs: Macs| macs.count(FlopConvention::Flops) as f64;
     let all = context.num_tokens()?;
     let encode = count(config.model.encode_macs(views.min_context, *height, *width)?);
-    let render = |tokens| Ok::<_, TrainError>(count(config.model.render_macs(*height, *width, tokens)?));
+    // The cases draw an image once, as training does.
+    let drawn_once = ModelConfig { patch_grids: PatchGrids::One, ..config.model.clone() };
+    let render = |tokens| Ok::<_, TrainError>(count(drawn_once.render_macs(*height, *width, tokens)?));
     let condense = |stored| count(config.model.condense_macs(all, stored));
     let targets = views.num_targets as f64;
     Ok(Some(match case {

@@ -263,7 +263,14 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
                 grids.iter().map(move |&num_patches| SceneSizes { num_render_tokens, num_patches, ..scene })
             });
             let rendered = drawn.map(|scene| part_macs(model, Part::Renderer, &scene));
-            rest += part_macs(model, Part::Condenser, &scene) + rendered.sum::<f64>();
+            // Grids share the keys and values, which LVSM has none of.
+            let shared = if model.has_latents() { 0 } else { grids.len() - 1 };
+            let shared = sweep.token_counts(count).into_iter().map(|num_render_tokens| {
+                let tokens_alone = SceneSizes { num_render_tokens, num_patches: 0, ..scene };
+                shared as f64 * part_macs(model, Part::Renderer, &tokens_alone)
+            });
+            let rendered = rendered.sum::<f64>() - shared.sum::<f64>();
+            rest += part_macs(model, Part::Condenser, &scene) + rendered;
         }
         (part_macs(model, Part::Encoder, &scene), rest)
     };

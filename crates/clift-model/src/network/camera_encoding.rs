@@ -2,8 +2,8 @@
 //! arXiv 2507.10496).
 //!
 //! Every token has a block-diagonal matrix `rho`, made of the world-to-camera matrix `g` of its view and of rotations by
-//! the place of its patch: rows and columns of patches from the principal point, so that a window of an image has the
-//! transforms of the whole. Attention runs on `rho_i^T q_i`, `rho_j^-1 k_j` and `rho_j^-1 v_j`, and `rho_i` is
+//! the row and the column of its patch, counted from the principal point: a window of an image has the rotations of the
+//! whole. Attention runs on `rho_i^T q_i`, `rho_j^-1 k_j` and `rho_j^-1 v_j`, and `rho_i` is
 //! applied to its output. A score then depends on `g_i g_j^-1` alone, the relative pose of two views.
 // B scenes, V views, n patches of a view, N = V n tokens, E width of a head, L values of a transform
 
@@ -49,31 +49,38 @@ impl TransformMaker {
         };
         let [batch, views] = cameras.dims();
         let [rows, columns] = [cameras.height, cameras.width].map(|side| side / self.patch_size);
-        let angles = self.angles(cameras, rows, columns);
+        let angles = self.rotations(cameras, rows, columns);
         let matrices = matrices.reshape([batch, views, 1, 32]).expand([batch, views, rows * columns, 32]);
         let len = 32 + self.head_width / 2;
         Some(TokenTransforms(Tensor::cat(vec![matrices, angles], 3).reshape([batch, views * rows * columns, len])))
     }
 
-    /// Computes cosines, then sines of the angles of every patch: half of them by its row, half by its column, in patches
-    /// from the principal point to the center of the patch.
-    fn angles(&self, cameras: &Cameras, rows: usize, columns: usize) -> Tensor<4> {
+    /// Returns cosines, then sines of the angles of every patch, `[B, V, n, E/2]`: half of them by its row, half by its
+    /// column, in patches from the principal point. The angles from the image center are exact; those from there to the
+    /// principal point are small, and 0 where it is the center.
+    fn rotations(&self, cameras: &Cameras, rows: usize, columns: usize) -> Tensor<4> {
         let [batch, views] = cameras.dims();
         let count = self.head_width / 8;
-        let options = (&cameras.c2w.device(), cameras.c2w.dtype());
+        let options = (&cameras.intrinsics.device(), cameras.intrinsics.dtype());
+        let tensor =
+            |values: Vec<f64>, shape: [usize; 4]| Tensor::<4>::from_data(TensorData::new(values, shape), options);
         let frequencies: Vec<f64> = (0..count).map(|i| LONGEST.powf(-(i as f64) / count as f64)).collect();
-        let frequencies = Tensor::<5>::from_data(TensorData::new(frequencies, [1, 1, 1, 1, count]), options);
-        let side = self.patch_size as f64;
-        let angles = |principal_point: usize, num_patches: usize, shape: [usize; 5]| {
-            let centers: Vec<f64> = (0..num_patches).map(|patch| patch as f64 + 0.5).collect();
-            let centers = Tensor::<5>::from_data(TensorData::new(centers, shape), options);
-            let point = cameras.intrinsics.clone().narrow(2, principal_point, 1).reshape([batch, views, 1, 1, 1]);
-            let angles = (centers - point.div_scalar(side)) * frequencies.clone();
-            angles.expand([batch, views, rows, columns, count])
+        let offset = |axis: usize, side: usize| {
+            let point = cameras.intrinsics.clone().narrow(2, axis, 1).reshape([batch, views, 1, 1]);
+            let patches = (-point).add_scalar(side as f64 / 2.0).div_scalar(self.patch_size as f64);
+            patches * tensor(frequencies.clone(), [1, 1, 1, count])
         };
-        let angles = vec![angles(3, rows, [1, 1, rows, 1, 1]), angles(2, columns, [1, 1, 1, columns, 1])];
-        let angles = Tensor::cat(angles, 4);
-        Tensor::cat(vec![angles.clone().cos(), angles.sin()], 4).reshape([batch, views, rows * columns, 4 * count])
+        let offset = Tensor::cat(vec![offset(3, cameras.height), offset(2, cameras.width)], 3); // [B, V, 1, E/4]
+        let from_center = |patch: usize, num_patches: usize| patch as f64 + 0.5 - num_patches as f64 / 2.0;
+        let angles: Vec<f64> = (0..rows * columns)
+            .flat_map(|patch| [from_center(patch / columns, rows), from_center(patch % columns, columns)])
+            .flat_map(|place| frequencies.iter().map(move |frequency| place * frequency))
+            .collect();
+        let shape = [1, 1, rows * columns, 2 * count];
+        let [cos, sin] = [f64::cos, f64::sin].map(|f| tensor(angles.iter().copied().map(f).collect(), shape));
+        let (offset_cos, offset_sin) = (offset.clone().cos(), offset.sin());
+        let cosines = cos.clone() * offset_cos.clone() - sin.clone() * offset_sin.clone();
+        Tensor::cat(vec![cosines, sin * offset_cos + cos * offset_sin], 3)
     }
 }
 

@@ -34,8 +34,8 @@ pub struct ModelConfig {
     /// How attention knows the cameras.
     #[serde(skip_serializing_if = "is_default")]
     pub camera_encoding: CameraEncoding,
-    /// Times that an image is drawn, with patches shifted by half of their side, and averaged: 1, 2 or 4. Training draws an
-    /// image once.
+    /// Number of drawings, with patches shifted by half a patch, whose mean is an image: 1, 2 or 4. Training draws an image
+    /// once.
     #[serde(skip_serializing_if = "is_default")]
     pub patch_grids: PatchGrids,
     /// The condenser of stage 2.
@@ -262,12 +262,18 @@ impl ModelConfig {
                 return bad(key, self.camera_encoding.to_string(), fix);
             }
         }
-        if self.camera_encoding == CameraEncoding::Prope && self.patch_grids != PatchGrids::One {
-            let fix =
-                "model.camera_encoding = \"prope\" measures in units of the image size, which other grids change: \
-                       write 1"
-                    .to_owned();
-            return bad("model.patch_grids", usize::from(self.patch_grids).to_string(), fix);
+        if self.patch_grids != PatchGrids::One {
+            let reason = match (self.camera_encoding, self.patch_size) {
+                (CameraEncoding::Prope, _) => Some(
+                    "model.camera_encoding = \"prope\" measures in units of the image size, which other grids change",
+                ),
+                (_, 1) => Some("patches of one pixel have no halves"),
+                _ => None,
+            };
+            if let Some(reason) = reason {
+                let value = usize::from(self.patch_grids).to_string();
+                return bad("model.patch_grids", value, format!("{reason}: write 1"));
+            }
         }
         if self.has_latents() {
             let fix = "of LVSM, write \"paper\" or \"released-re10k\", its network in CLiFT's release".to_owned();

@@ -73,7 +73,11 @@ impl Renderer {
     /// - `tokens`: one set per scene, shared by its target views, or one set per target view
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
-        self.render_cached(&self.project_tokens(tokens), targets)
+        // One grid needs no keys and values of all blocks at once.
+        match self.patch_grids {
+            PatchGrids::One => self.forward(tokens, targets),
+            PatchGrids::Two | PatchGrids::Four => self.render_cached(&self.project_tokens(tokens), targets),
+        }
     }
 
     /// Draws target views once, on one patch grid, as in training.

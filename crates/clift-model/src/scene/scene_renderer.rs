@@ -8,6 +8,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::error::ModelError;
 use crate::network::camera_encoding::TransformMaker;
+use crate::network::config::ModelConfig;
 use crate::network::render_tokens::KeyValueCache;
 use crate::network::renderer::Renderer;
 use crate::network::tokens::Tokens;
@@ -15,7 +16,7 @@ use crate::scene::scene::Scene;
 use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
 use crate::views::camera::ViewCamera;
-use crate::views::interleave::interleaved;
+use crate::views::interleave::{interleaved, parts};
 use crate::views::patch_grids::PatchGrids;
 use crate::views::upload::Cameras;
 use crate::weights::hash::{renderer_hash, weights_hash};
@@ -30,6 +31,15 @@ const PATCHES_PER_CALL: usize = 1 << 15;
 /// Returns the number of frames of `num_patches` patches that one call renders.
 pub fn frames_per_call(num_patches: usize) -> usize {
     (PATCHES_PER_CALL / num_patches.max(1)).clamp(1, FRAMES_PER_CALL)
+}
+
+/// Returns the number of images that a frame of a scene is interleaved from, and the patches of all of them on the largest
+/// grid.
+pub fn drawn_images(model: &ModelConfig, trained_height: usize, height: usize, width: usize) -> [usize; 2] {
+    let (k, size) = parts(trained_height, model.patch_size, [height, width]);
+    let grids = model.patch_grids.patches(size.map(|side| side / model.patch_size));
+    let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
+    [k * k, k * k * largest]
 }
 
 /// Reads the renderer of a scene from a weight file.
@@ -192,7 +202,6 @@ mod tests {
     use super::*;
     use crate::network::architecture::CameraEncoding;
     use crate::network::clift::Clift;
-    use crate::network::config::ModelConfig;
     use crate::scene::scene::tests::{camera, scene};
     use crate::testing::devices;
     use crate::tokens::selection::rules::SelectionPreset;

@@ -1,12 +1,19 @@
 //! Images larger than those of training, interleaved from several of about that size.
 //!
 //! A network draws well at the size it was trained on: at twice that size its patches cover half the angle. Every k-th pixel
-//! of every k-th row is an image of the trained size; k x k of them, each with its own rays, are all pixels.
+//! of every k-th row is an image of the trained size. k x k such images, each with the rays of its pixels, make the large one.
 // B scenes, V views, k images along either axis, H rows, W columns
 
 use burn::tensor::{Tensor, TensorData};
 
 use crate::views::upload::Cameras;
+
+/// Returns the number of images along either axis that an image of `size` is interleaved from, and their size; sizes are
+/// `[height, width]`.
+pub(crate) fn parts(trained_height: usize, patch_size: usize, size: [usize; 2]) -> (usize, [usize; 2]) {
+    let k = ((size[0] as f64 / trained_height as f64).round() as usize).max(1);
+    if k == 1 { (k, size) } else { (k, size.map(|side| side.div_ceil(k).next_multiple_of(patch_size))) }
+}
 
 /// Draws views of any size as interleaved images of about the rows of `trained_height`, sides rounded up to whole patches.
 ///
@@ -19,12 +26,11 @@ pub(crate) fn interleaved(
     targets: &Cameras,
     draw: impl Fn(&Cameras) -> Tensor<5>,
 ) -> Tensor<5> {
-    let k = ((targets.height as f64 / trained_height as f64).round() as usize).max(1);
+    let (k, [height, width]) = parts(trained_height, patch_size, [targets.height, targets.width]);
     if k == 1 {
         return draw(targets);
     }
     let [batch, views] = targets.dims();
-    let [height, width] = [targets.height, targets.width].map(|side| side.div_ceil(k).next_multiple_of(patch_size));
     // Pixel u of the image at phase j is pixel k u + j of the whole: x = (k u + j + 0.5 - cx) / fx.
     let options = (&targets.intrinsics.device(), targets.intrinsics.dtype());
     let scale = 1.0 / k as f64;

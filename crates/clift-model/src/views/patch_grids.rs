@@ -1,7 +1,7 @@
 //! Images averaged over shifted grids of patches ("cycle spinning", Coifman and Donoho 1995).
 //!
 //! A network that draws every patch by itself leaves seams between patches. An image that is drawn again with its patches
-//! elsewhere has its seams elsewhere; the mean, weighted by the distance from the seams, has none.
+//! elsewhere has its seams elsewhere. In the mean, weighted by the distance from the seams, they are faint.
 // B scenes, V views, H rows, W columns
 
 use burn::tensor::{Tensor, TensorData};
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn seams_between_patches_vanish() {
+    fn seams_between_patches_are_fainter() {
         let device = Device::flex();
         // A chessboard of patches: the largest jump between neighbours of a row is at a seam.
         let draw = |cameras: &Cameras| {

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::Device;
 use clift_data::{ClipReader, open_dataset};
 use clift_eval::{EvalFrames, EvalModels, Method, Summary};
-use clift_model::{ModelError, ModelPath, TokenCodec, TrainedModel};
+use clift_model::{ModelConfig, ModelError, ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
 use crate::distributed::ranks::Ranks;
@@ -97,7 +97,9 @@ pub(crate) fn open_lvsm(
         return refuse("another run of LVSM has as many latents: choose runs with distinct model.num_latents");
     }
     let found = weights(config, Stage::Stage1, "the weights of stage 1")?;
-    Ok(TrainedModel::open(&found, &config.model, device)?)
+    // All methods are drawn on as many patch grids.
+    let model = ModelConfig { patch_grids: evaluated.model.patch_grids, ..config.model.clone() };
+    Ok(TrainedModel::open(&found, &model, device)?)
 }
 
 /// Finds the weights of a stage, `what` in messages.

@@ -18,13 +18,14 @@ const FILE: &str = "run.json";
 const VERSION: u32 = 1;
 
 /// Keys that may change when a run is resumed.
-const FREE_KEYS: [&str; 8] = [
+const FREE_KEYS: [&str; 9] = [
     "run_dir",
     "device",
     "activation_checkpointing",
     "data.num_threads",
     "data.num_prefetch",
     "data.image_cache.",
+    "model.patch_grids",
     "checkpoint.",
     "eval.",
 ];

@@ -7,7 +7,7 @@ use clift_data::{
     DataError, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
     open_dataset, open_source,
 };
-use clift_model::{CameraEncoding, ModelError, ModelPath, TrainedModel};
+use clift_model::{CameraEncoding, ModelConfig, ModelError, ModelPath, TrainedModel};
 use clift_train::{Config, Override};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
@@ -47,7 +47,7 @@ impl ModelArgs {
         let path = ModelPath::find(model)?;
         let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
         // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
-        if config.model != path.config()? {
+        if config.model != (ModelConfig { patch_grids: config.model.patch_grids, ..path.config()? }) {
             usage_bail!("--set model: the weights were trained with another network; remove the override");
         }
         config.device = args.device.unwrap_or(config.device);

@@ -9,8 +9,8 @@ use clift_data::{
 };
 use clift_eval::available_bytes;
 use clift_model::{
-    DeviceName, MAX_SIDE_PX, ModelError, ModelPath, PatchGrids, RenderBudget, Scene, SceneRenderer, ViewCamera,
-    frames_per_call, load_renderer, render_bytes,
+    DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, RenderBudget, Scene, SceneRenderer,
+    ViewCamera, drawn_images, frames_per_call, load_renderer, render_bytes,
 };
 use serde::Serialize;
 
@@ -52,11 +52,14 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let (scene, _) = Scene::read_for(&args.scene, args.model.as_deref())?;
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
-    check_size(&scene, [width, height], args.render.is_some(), device)?;
+    let patch_grids = args.patch_grids.unwrap_or(scene.model.patch_grids);
+    let model = ModelConfig { patch_grids, ..scene.model.clone() };
+    model.validate()?;
+    check_size(&scene, &model, [width, height], args.render.is_some(), device)?;
     let effect = match height.cmp(&scene.height) {
         Ordering::Less => Some("lose quality"),
         Ordering::Equal => None,
-        Ordering::Greater => Some("are smooth, but show no more detail"),
+        Ordering::Greater => Some("show no more detail"),
     };
     if let Some(effect) = effect {
         let trained = format!("{} x {}", scene.width, scene.height);
@@ -74,7 +77,6 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let opened = device.open()?;
     args.precision.check("--precision", &opened)?;
     let _precision = args.precision.scope();
-    let patch_grids = args.patch_grids.unwrap_or(scene.model.patch_grids);
     let network = load_renderer(&scene, &weights, &opened)?;
     let mut renderer = SceneRenderer::new(&scene, network, args.selection.rules(), &opened)?;
     renderer.set_patch_grids(patch_grids);
@@ -127,14 +129,21 @@ pub fn scene_weights(scene: &Scene, file: &Path, model: Option<&Path>) -> anyhow
 }
 
 /// Refuses sizes that are not multiples of the patch, exceed the limit of images or exceed the available memory.
-fn check_size(scene: &Scene, [width, height]: [usize; 2], selects: bool, device: DeviceName) -> anyhow::Result<()> {
+fn check_size(
+    scene: &Scene,
+    model: &ModelConfig,
+    [width, height]: [usize; 2],
+    selects: bool,
+    device: DeviceName,
+) -> anyhow::Result<()> {
     if width.max(height) > MAX_SIDE_PX {
         usage_bail!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels per side");
     }
-    let num_patches = scene.model.num_patches(1, height, width)?;
+    let num_patches = model.num_patches(1, height, width)?;
     // With token selection every frame has its own tokens and is rendered alone.
     let num_frames = if selects { 1 } else { frames_per_call(num_patches) };
-    let needed = render_bytes(&scene.model, scene.num_tokens(), num_frames, num_patches * num_frames);
+    let [images, patches] = drawn_images(model, scene.height, height, width);
+    let needed = render_bytes(model, scene.num_tokens(), images * num_frames, patches * num_frames);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (file_size(needed), file_size(available));
         usage_bail!(
