@@ -2,6 +2,7 @@
 
 use std::process::{Child, Command};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use crate::support::{BINARY, Place, start};
 
@@ -34,7 +35,10 @@ pub fn start_train(place: &Place, num_ranks: usize, words: &str, set: &[&str]) -
 
 /// The process ids of the ranks of a running `mpirun`, in no order.
 pub fn ranks_of(mpirun: &Child) -> Vec<u32> {
-    let id = mpirun.id();
+    ranks_of_id(mpirun.id())
+}
+
+fn ranks_of_id(id: u32) -> Vec<u32> {
     let children = std::fs::read_to_string(format!("/proc/{id}/task/{id}/children")).unwrap_or_default();
     let is_rank =
         |id: &u32| std::fs::read_to_string(format!("/proc/{id}/cmdline")).is_ok_and(|words| words.starts_with(BINARY));
@@ -44,6 +48,20 @@ pub fn ranks_of(mpirun: &Child) -> Vec<u32> {
 pub fn signal(id: u32, name: &str) {
     // The rank may have ended meanwhile.
     drop(Command::new("kill").args([name, &id.to_string()]).output());
+}
+
+/// Ends an `mpirun` that is still there after a minute: where a rank dies while it starts, Open MPI can wait for ever.
+pub fn end_within_a_minute(mpirun: &Child) {
+    let id = mpirun.id();
+    std::thread::spawn(move || {
+        for _ in 0..60 {
+            std::thread::sleep(Duration::from_secs(1));
+            if !is_running(id) {
+                return;
+            }
+        }
+        ranks_of_id(id).into_iter().chain([id]).for_each(|id| signal(id, "-KILL"));
+    });
 }
 
 /// Whether a process is there, not counting one that has ended and that nobody has waited for.

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::engine::{one_at_a_time, ranks_of, signal, start_train};
+use crate::engine::{end_within_a_minute, one_at_a_time, ranks_of, signal, start_train};
 use crate::support::{Place, finish};
 
 /// Three parts, for up to three ranks; a checkpoint after every second step.
@@ -56,6 +56,9 @@ fn runs_with_killed_ranks_end_the_same_on_any_number_of_ranks() {
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 ranks_of(&child).into_iter().take(1).for_each(|id| signal(id, "-KILL"));
+            }
+            if num_kills < NUM_KILLS {
+                end_within_a_minute(&child);
             }
             let ran = finish(child);
             if ran.code == Some(0) {
