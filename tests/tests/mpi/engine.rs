@@ -60,6 +60,7 @@ pub fn end_within_a_minute(mpirun: &Child) {
                 return;
             }
         }
+        eprintln!("mpirun {id} did not end within a minute of a killed rank: ended by the test");
         ranks_of_id(id).into_iter().chain([id]).for_each(|id| signal(id, "-KILL"));
     });
 }
