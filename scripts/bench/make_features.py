@@ -1,7 +1,7 @@
 """Writes encoder tokens to cluster: `python scripts/bench/make_features.py OUT.safetensors [options]`.
 
 The file holds one tensor, "features" `[N, D]` in f32, of one scene with evenly spread context views. The encoder is
-the PyTorch twin's: with seeded weights, or with those of a run directory that `clift train` wrote.
+the PyTorch twin's, with seeded weights.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from __future__ import annotations
 import argparse
 import io
 import sys
-import tomllib
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "twin"))
@@ -48,22 +47,11 @@ def read_clip(chunk: Path, scene: int, views: int, side: int) -> tuple[Tensor, T
     return torch.stack(images)[None], torch.stack(intrinsics)[None], c2w[None]
 
 
-def trained_encoder(run: Path) -> twin.Encoder:
-    """The stage-1 encoder of a run directory."""
-    c = tomllib.loads((run / "config.toml").read_text())["model"]
-    encoder = twin.Encoder(c["dim"], c["num_heads"], c["num_encoder_blocks"], c["feed_forward_dim"])
-    state = load_file(run / "stage1" / "model.safetensors")
-    mine = {key.removeprefix("encoder."): value for key, value in state.items() if key.startswith("encoder.")}
-    twin.load_state(encoder, mine)
-    return encoder
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--clip", type=Path, metavar="CHUNK", help="a chunk file; without it pictures are smooth noise")
     parser.add_argument("--scene", type=int, default=0, help="which clip of the chunk")
-    parser.add_argument("--run", type=Path, help="a run directory with a trained encoder; without it, seeded weights")
     parser.add_argument("--contexts", type=int, default=4)
     parser.add_argument("--side", type=int, default=256, help="pixels of a view's side")
     parser.add_argument("--dim", type=int, default=768)
@@ -74,10 +62,7 @@ def main() -> None:
     args = parser.parse_args()
 
     torch.manual_seed(args.seed)
-    if args.run:
-        encoder = trained_encoder(args.run)
-    else:
-        encoder = twin.Encoder(args.dim, args.heads, args.blocks, args.feed_forward)
+    encoder = twin.Encoder(args.dim, args.heads, args.blocks, args.feed_forward)
     if args.clip:
         images, intrinsics, c2w = read_clip(args.clip, args.scene, args.contexts, args.side)
     else:

@@ -36,7 +36,7 @@ PATCH_4, PATCH_8 = "model.patch_size=4", "model.patch_size=8"
 ADAMW, MUON = optimizer(), optimizer(algorithm="muon", learning_rate=6e-3)
 # The options one by one and together, all with a cosine, then the config itself ("whole") and changes of it.
 TRAINED = {
-    "former recipe": [PATCH_8, PLUCKER, ADAMW],
+    "baseline recipe": [PATCH_8, PLUCKER, ADAMW],
     "gta": [PATCH_8, GTA, ADAMW],
     "patch of 4": [PATCH_4, PLUCKER, ADAMW],
     "Muon": [PATCH_8, PLUCKER, MUON],

@@ -297,7 +297,9 @@ fn prepare(base: &Path) {
     shrink(&mut rooms);
     rooms.extend(["--set", "run_dir=runs/rooms"].map(str::to_owned));
     clift(&rooms.iter().map(String::as_str).collect::<Vec<_>>());
-    copy(&base.join("runs/rooms"), "runs/capture");
+    for name in ["runs/capture", "runs/attic"] {
+        copy(&base.join("runs/rooms"), name);
+    }
     clift(&["export", "runs/rooms", "--format", "f16", "-o", "models/rooms"]);
     let tiny = ["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"];
     clift(&tiny);
