@@ -15,8 +15,7 @@ use crate::viewer::tab::Viewer;
 const KEY: &str = "00000000000000b1";
 
 /// Words of the documents, and those for small data.
-const SMALLER: [(&str, &str); 10] = [
-    ("target/release/clift ", "clift "),
+const SMALLER: [(&str, &str); 9] = [
     // Later examples read the other data.
     (" /data/re10k-txt /data/re10k ", " /data/re10k-txt /data/converted "),
     (" /data/", " data/"),
@@ -113,7 +112,8 @@ fn commands(text: &str) -> Vec<String> {
             is_code = !is_code;
             continue;
         }
-        let is_command = line.starts_with("clift ") || line.starts_with("target/release/clift ");
+        // A column of an output begins with the name and two spaces.
+        let is_command = line.starts_with("clift ") && !line.starts_with("clift  ");
         let Some(line) = (match open.take() {
             Some(begun) => Some(begun + line),
             None => (is_code && is_command).then(|| line.to_owned()),

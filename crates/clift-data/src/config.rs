@@ -30,10 +30,10 @@ pub struct DataConfig {
     pub height: usize,
     /// Mean orientation of the context views.
     pub pose_rotation: PoseRotation,
-    /// Cameras that define the scale of a scene: contexts only, or contexts and targets (as in the reference
-    /// implementation).
+    /// Cameras that define the scale of a scene: contexts only, or contexts and targets (as in the authors'
+    /// released code).
     pub pose_scale: PoseScale,
-    /// Former notation of `crop = "exact"`.
+    /// Older form of `crop = "exact"`.
     pub exact_principal_point: bool,
     /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
     #[serde(skip_serializing_if = "is_default")]

@@ -118,14 +118,6 @@ pub enum DataError {
         /// File.
         path: PathBuf,
     },
-    /// A scene has no entry in the evaluation index; unused scenes have a `null` entry.
-    #[error("scene {key} is not in the evaluation index: {path}", path = path.display())]
-    MissingIndexKey {
-        /// Scene key.
-        key: String,
-        /// Index file.
-        path: PathBuf,
-    },
     /// A frame index is out of range.
     #[error("scene {key} has {num_frames} frames; frame {frame} (counted from 0) does not exist")]
     NoSuchFrame {

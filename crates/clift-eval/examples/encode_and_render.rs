@@ -15,7 +15,7 @@ use clift_data::{
     ClipOptions, ClipReader, DatasetRoot, PoseRotation, PoseScale, SourceOptions, Split, ViewIndices, open_source,
 };
 use clift_eval::{Canvas, EncodeOptions, encode, upload_cameras};
-use clift_model::{DeviceName, Grouping, KMeans, ModelPath, SceneModel, TokenCount, TokenFormat, TrainedModel};
+use clift_model::{DeviceName, Grouping, KMeans, ModelPath, TokenCount, TokenFormat, TrainedModel};
 
 /// Images are scaled and cropped to the size that the model was trained on.
 const SIZE_PX: usize = 256;

@@ -3,8 +3,8 @@
 
 use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
 use clift_model::{
-    Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneModel, SceneNormalization, TokenCount,
-    TokenKind, TrainedModel, total_variance,
+    Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneNormalization, TokenCount, TokenKind,
+    TrainedModel, total_variance,
 };
 
 use crate::error::EvalError;

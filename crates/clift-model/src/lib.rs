@@ -5,7 +5,7 @@
 //! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Clift`] holds the three networks.
 //!
 //! ```
-//! use clift_model::{Cameras, Clift, DeviceName, KMeans, ModelConfig, SceneModel, Views};
+//! use clift_model::{Cameras, Clift, DeviceName, KMeans, ModelConfig, Views};
 //!
 //! let device = DeviceName::Flex.open()?;
 //! let config = ModelConfig { dim: 16, num_heads: 2, feed_forward_dim: 32, ..ModelConfig::default() };
@@ -82,7 +82,6 @@ pub use network::encoder::Encoder;
 pub use network::init::Init;
 pub use network::render_tokens::{KeyValueCache, RenderTokens};
 pub use network::renderer::Renderer;
-pub use network::scene_model::SceneModel;
 pub use network::tokens::Tokens;
 // Layers and operations of the networks
 pub use network::blocks::attention::SelfAttention;
@@ -96,7 +95,7 @@ pub use ops::linear::{gelu_linear, linear, norm_linear};
 // Parameters, multiply-accumulates and memory of a network
 pub use cost::largest_tensor::{kmeans_values, largest_tensors};
 pub use cost::macs::{FlopConvention, Macs};
-pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
+pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, update_bytes};
 pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
 pub use network::layers::Part;
@@ -118,7 +117,7 @@ pub use codec::transform::{Moments, Transform};
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, drawn_images, frames_per_call, load_renderer};
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
 pub use scene::token_coding::{CodedLoss, TokenCoding};
 pub use scene::token_format::TokenFormat;
 pub use scene::write::check_output_path;

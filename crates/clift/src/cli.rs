@@ -140,7 +140,7 @@ Examples:
     /// Walk through scenes in a browser
     ///
     /// Serves one page on this machine and prints its URL, which holds the token of the session, as the first line. In the
-    /// page: orbit and fly, numbers of rendered and stored tokens, a frame rate to hold, the tokens of each picture on the
+    /// page: orbit and fly, numbers of rendered and stored tokens, a frame rate to hold, the tokens of each image on the
     /// context views, camera paths for `clift render --path` and, for a run, true images beside the renderings.
     #[command(after_help = "\
 Examples:
@@ -199,7 +199,7 @@ Examples:
     #[command(after_help = "\
 Examples:
   clift export models/re10k --format pytorch -o re10k.ckpt
-  clift export runs/tiny/stage1/model.safetensors --format safetensors -o tiny.safetensors
+  clift export runs/re10k/stage1/model.safetensors --format safetensors -o stage1.safetensors
   clift export runs/rooms --format f16 -o models/rooms")]
     Export(ExportArgs),
     /// Print the completion script of a shell

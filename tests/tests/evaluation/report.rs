@@ -74,5 +74,7 @@ fn render_counts_at_or_above_storage_are_refused() {
     for count in ["8", "1.0", "400"] {
         place.eval(&format!("run --render {count}")).fails_with(2, &["`eval.render`", "less than 8"]);
     }
-    place.eval("run --set eval.selection=\"nearest\"").fails_with(2, &["paper, global, scaled, random"]);
+    place
+        .eval("run --set eval.selection=\"nearest\"")
+        .fails_with(2, &["\"paper\", \"global\", \"scaled\", \"random\""]);
 }

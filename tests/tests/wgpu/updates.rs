@@ -1,7 +1,7 @@
 //! Whole updates by the code of training: loss, gradient, AdamW.
 
 use clift_eval::upload_images;
-use clift_model::{Clift, Clusters, RenderTokens, SceneModel};
+use clift_model::{Clift, Clusters, RenderTokens};
 use clift_train::{Loss, OptimizerConfig, Stage, StageBatch, TokenSelection, TrainState, freeze};
 
 use crate::modules::subsets;

@@ -7,7 +7,7 @@ use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
-use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount, Tokens};
+use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
@@ -70,7 +70,7 @@ impl BenchContext {
         config.precision.check("precision", &device)?;
         let context = Self {
             device,
-            is_cpu: matches!(config.device, DeviceName::Flex | DeviceName::Ndarray),
+            is_cpu: config.device.is_cpu(),
             storage: options.storage,
             render: options.render,
             features: options.features.clone(),

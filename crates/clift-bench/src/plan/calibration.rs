@@ -7,7 +7,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::{ClipReader, Split, item_rng, median, open_dataset, step_rng};
 use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
-use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
+use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
     ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TokenSelection, TrainError, TypicalStep, clip_global_norm,
     eval_sizes, global_norm, measures_lpips, render_loss, scene_with_all_tokens, seeded_batch, seeded_clip,

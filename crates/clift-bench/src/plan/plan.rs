@@ -6,7 +6,7 @@
 
 use clift_data::SourceKind;
 use clift_eval::available_bytes;
-use clift_model::{DeviceName, ModelConfig, Parameters, Part, SceneSizes};
+use clift_model::{DeviceName, FlopConvention, ModelConfig, Parameters, Part, SceneSizes};
 use clift_train::{
     BatchParts, Config, Stage, StageSettings, TrainError, cluster_counts, eval_sizes, num_tokens, peak_bytes,
     possible_sizes, scene_with_all_tokens, scene_with_stored_tokens, typical_sizes,
@@ -110,9 +110,8 @@ pub fn plan(config: &Config, options: &PlanOptions) -> Result<Plan, TrainError> 
         let (num_views, num_threads) = views_and_threads(config, part.part, num_ranks);
         part.loading_s = per_view_s.map(|seconds| seconds * num_views);
         part.seconds = part.compute_s.map(|compute| {
-            let is_cpu = matches!(config.device, DeviceName::Flex | DeviceName::Ndarray);
-            let shared =
-                part.busy_threads.filter(|_| is_cpu).map(|busy| SharedCores { cores: plan.threads as f64, busy });
+            let busy = part.busy_threads.filter(|_| config.device.is_cpu());
+            let shared = busy.map(|busy| SharedCores { cores: plan.threads as f64, busy });
             let sum_s = sent_bytes_per_s.map_or(0.0, |rate| part.sent_bytes as f64 / rate);
             seconds_per_unit(compute + sum_s, part.loading_s.unwrap_or(0.0), num_threads, shared)
         });
@@ -251,33 +250,26 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
     let num_targets = eval.num_targets;
     let scene = scene_with_all_tokens(config, eval.num_context, num_targets)?;
-    let grids = config.model.drawn_patches(config.data.height, config.data.width)?;
     let counts = config.eval_storage().iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
     // Multiply-accumulates of the encoder, and of all that reads its tokens.
-    let encode_and_rest = |model: &ModelConfig| {
+    let encode_and_rest = |model: &ModelConfig| -> Result<(f64, f64), TrainError> {
         let mut rest = 0.0;
         for &count in &counts {
             let scene = scene_with_stored_tokens(scene, count);
-            let drawn = sweep.token_counts(count).into_iter().flat_map(|num_render_tokens| {
-                grids.iter().map(move |&num_patches| SceneSizes { num_render_tokens, num_patches, ..scene })
-            });
-            let rendered = drawn.map(|scene| part_macs(model, Part::Renderer, &scene));
-            // Grids share the keys and values, which LVSM has none of.
-            let shared = if model.has_latents() { 0 } else { grids.len() - 1 };
-            let shared = sweep.token_counts(count).into_iter().map(|num_render_tokens| {
-                let tokens_alone = SceneSizes { num_render_tokens, num_patches: 0, ..scene };
-                shared as f64 * part_macs(model, Part::Renderer, &tokens_alone)
-            });
-            let rendered = rendered.sum::<f64>() - shared.sum::<f64>();
-            rest += part_macs(model, Part::Condenser, &scene) + rendered;
+            rest += part_macs(model, Part::Condenser, &scene);
+            for num_render_tokens in sweep.token_counts(count) {
+                let scene = SceneSizes { num_render_tokens, ..scene };
+                let macs = model.render_views_macs(config.data.height, config.data.width, &scene)?;
+                rest += macs.count(FlopConvention::Macs) as f64;
+            }
         }
-        (part_macs(model, Part::Encoder, &scene), rest)
+        Ok((part_macs(model, Part::Encoder, &scene), rest))
     };
-    let (encoder, rest) = encode_and_rest(&config.model);
+    let (encoder, rest) = encode_and_rest(&config.model)?;
     let compute_s = if is_timed {
         let rates = inference_rates(config, eval.num_context, num_targets, None)?;
-        let (timed_encoder, timed_rest) = encode_and_rest(&rates.timed);
+        let (timed_encoder, timed_rest) = encode_and_rest(&rates.timed)?;
         Some(
             rates.evaluation_s
                 + (encoder - timed_encoder).max(0.0) * rates.encode_per_mac

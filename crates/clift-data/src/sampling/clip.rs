@@ -1,10 +1,14 @@
 //! View indices, posed views and clips.
 
+use serde::{Deserialize, Serialize};
+
 use crate::geometry::camera::Intrinsics;
 use crate::geometry::pose::Pose;
 
-/// Context and target frames of a scene, as positions in the list of frames.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// Context and target frames of a scene, as positions in the list of frames. Further fields of published evaluation indices are
+/// ignored.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct ViewIndices {
     /// Frames for the encoder.
     pub context: Vec<usize>,

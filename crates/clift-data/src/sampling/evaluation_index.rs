@@ -1,6 +1,6 @@
 //! Evaluation indices: context and target frames of the evaluated scenes.
 
-use std::collections::HashMap;
+use std::collections::HashSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,6 @@ pub struct EvaluationIndex {
     path: PathBuf,
     /// Every key with its views, `None` for null and empty entries.
     entries: Vec<(String, Option<ViewIndices>)>,
-    positions: HashMap<String, usize>,
 }
 
 /// One scene to evaluate.
@@ -43,24 +42,22 @@ impl EvaluationIndex {
         let file: IndexFile = parse_json(&text).map_err(|error| {
             bad(format!("expected {{key: {{\"context\": [..], \"target\": [..]}} or null}}, got {error}"))
         })?;
-        let mut positions = HashMap::with_capacity(file.0.len());
+        let mut keys = HashSet::with_capacity(file.0.len());
         let mut entries = Vec::with_capacity(file.0.len());
         for (key, entry) in file.0 {
-            let views = match entry.map(|Entry { context, target }| (context, target)) {
-                None => None,
-                Some((context, target)) if context.is_empty() && target.is_empty() => None,
-                Some((context, target)) if context.is_empty() || target.is_empty() => {
-                    let (contexts, targets) = (context.len(), target.len());
-                    return Err(bad(format!("scene {key} has {contexts} context and {targets} target frames")));
-                }
-                Some((context, target)) => Some(ViewIndices { context, target }),
-            };
-            if positions.insert(key.clone(), entries.len()).is_some() {
+            let views = entry.filter(|entry| *entry != ViewIndices::default());
+            if let Some(ViewIndices { context, target }) = &views
+                && (context.is_empty() || target.is_empty())
+            {
+                let (contexts, targets) = (context.len(), target.len());
+                return Err(bad(format!("scene {key} has {contexts} context and {targets} target frames")));
+            }
+            if !keys.insert(key.clone()) {
                 return Err(bad(format!("scene {key} is listed twice")));
             }
             entries.push((key, views));
         }
-        Ok(Self { path: path.to_path_buf(), entries, positions })
+        Ok(Self { path: path.to_path_buf(), entries })
     }
 
     /// Removes the targets that are also contexts. Scenes without another target are skipped by [`select`](Self::select).
@@ -81,19 +78,6 @@ impl EvaluationIndex {
     /// Iterates over the entries with views, in file order.
     pub fn usable(&self) -> impl Iterator<Item = (&str, &ViewIndices)> {
         self.entries.iter().filter_map(|(key, views)| Some((key.as_str(), views.as_ref()?)))
-    }
-
-    /// Returns the views of scene `key`, which has `num_frames` frames; `None` for a null or empty entry.
-    ///
-    /// # Errors
-    /// [`DataError::MissingIndexKey`] for a key that is not in the index, [`DataError::BadIndex`] for a frame beyond the
-    /// end of the scene.
-    pub fn views(&self, key: &str, num_frames: usize) -> Result<Option<&ViewIndices>, DataError> {
-        let missing = || DataError::MissingIndexKey { key: key.to_owned(), path: self.path.clone() };
-        let position = self.positions.get(key).ok_or_else(missing)?;
-        let Some(views) = &self.entries[*position].1 else { return Ok(None) };
-        self.check_frames(key, views, num_frames)?;
-        Ok(Some(views))
     }
 
     /// Selects the first `limit` evaluable scenes of `source` (0: all), in file order.
@@ -140,16 +124,7 @@ impl EvaluationIndex {
 }
 
 /// A JSON map in file order.
-struct IndexFile(Vec<(String, Option<Entry>)>);
-
-/// Frames of one scene. Further fields of published indices are ignored.
-#[derive(Deserialize)]
-struct Entry {
-    #[serde(default)]
-    context: Vec<usize>,
-    #[serde(default)]
-    target: Vec<usize>,
-}
+struct IndexFile(Vec<(String, Option<ViewIndices>)>);
 
 impl<'de> Deserialize<'de> for IndexFile {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
@@ -241,15 +216,9 @@ mod tests {
         )
         .unwrap();
         assert_eq!(index.num_keys(), 4);
-        assert_eq!(index.usable().map(|(key, _)| key).collect::<Vec<_>>(), ["c", "a"]);
-        let views = ViewIndices { context: vec![5, 1], target: vec![2, 2] };
-        assert_eq!(index.views("c", 6).unwrap(), Some(&views));
-        assert_eq!(index.views("b", 6).unwrap(), None);
-        assert_eq!(index.views("d", 6).unwrap(), None);
-        let missing = index.views("00ff", 9).unwrap_err().to_string();
-        assert!(missing.starts_with("scene 00ff is not in the evaluation index: "), "{missing}");
-        let message = index.views("c", 5).unwrap_err().to_string();
-        assert!(message.contains("frame 5 of scene c does not exist, the scene has 5 frames"), "{message}");
+        let [c, a] =
+            [[vec![5, 1], vec![2, 2]], [vec![0], vec![0]]].map(|[context, target]| ViewIndices { context, target });
+        assert_eq!(index.usable().collect::<Vec<_>>(), [("c", &c), ("a", &a)]);
     }
 
     #[test]

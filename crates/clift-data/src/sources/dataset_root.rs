@@ -170,7 +170,7 @@ impl<'a> SplitFolder<'a> {
         if num_photos > 0 {
             parts.push(format!(
                 "{} without cameras: compute poses first, with COLMAP (images in DIR/images; `colmap \
-                 automatic_reconstructor --workspace_path DIR --image_path DIR/images`) or nerfstudio (`ns-process-data \
+                 automatic_reconstructor --workspace_path DIR --image_path DIR/images --dense 0`) or nerfstudio (`ns-process-data \
                  images --data PHOTOS --output-dir DIR`), then open DIR",
                 plural(num_photos, "image")
             ));

@@ -15,7 +15,7 @@ pub enum SourceKind {
     Auto,
     /// Chunks of pixelSplat and DepthSplat: `NNNNNN.torch` files of many scenes with an `index.json`.
     Chunks,
-    /// One `.torch` file per scene, as in the reference implementation.
+    /// One `.torch` file per scene, as in the authors' released code.
     Scenes,
     /// RealEstate10K: text files of cameras, and folders of frames.
     Re10kTxt,

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use rayon::prelude::*;
-use serde::Serialize;
 
 use crate::error::DataError;
 use crate::files::atomic::replace_file;
@@ -132,14 +131,7 @@ pub(crate) fn write_index<'a>(
     path: &Path,
     entries: impl IntoIterator<Item = (&'a str, Option<ViewIndices>)>,
 ) -> Result<(), DataError> {
-    #[derive(Serialize)]
-    struct Entry {
-        context: Vec<usize>,
-        target: Vec<usize>,
-    }
-    let entry = |ViewIndices { context, target }| Entry { context, target };
-    let entries: BTreeMap<&str, Option<Entry>> =
-        entries.into_iter().map(|(key, views)| (key, views.map(entry))).collect();
+    let entries: BTreeMap<&str, Option<ViewIndices>> = entries.into_iter().collect();
     let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.to_path_buf() };
     let text = serde_json::to_vec(&entries).map_err(bad)?;
     replace_file(path, &text).map_err(DataError::io("writing the evaluation index", path))

@@ -7,8 +7,8 @@ use std::ops::Range;
 use burn::tensor::Tensor;
 use clift_data::{Clip, ClipReader, EvaluationItem, derive_seed, item_rng, mean};
 use clift_model::{
-    Cameras, Histograms, KMeans, LevelCounts, Moments, RateTable, SceneModel, TokenCodec, TokenCount, TokenKind,
-    Tokens, TrainedModel, Transform,
+    Cameras, Histograms, KMeans, LevelCounts, Moments, RateTable, TokenCodec, TokenCount, TokenKind, Tokens,
+    TrainedModel, Transform,
 };
 use rand::RngExt;
 

@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use clift_model::{ModelError, SelectionPreset, TokenCount, parse_value};
+use clift_model::{ModelError, TokenCount, parse_value};
 use strum::{IntoStaticStr, VariantArray};
 
 use crate::config::eval_config::EvalConfig;
@@ -47,7 +47,7 @@ impl Experiment {
         }
         if self == Self::Budget {
             // As in the published table: no momentum, no count per cell.
-            eval.selection = Selection::Preset(SelectionPreset::Global);
+            eval.selection = Selection::Global;
         }
     }
 }

@@ -1,33 +1,36 @@
 //! Token selection settings.
 
-use std::fmt;
 use std::str::FromStr;
 
-use clift_model::{ModelError, SelectionPreset};
+use clift_model::{ModelError, SelectionPreset, parse_value};
 use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 /// Selection of the rendered tokens of a view, for fewer tokens than stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
 pub enum Selection {
-    /// A published preset of Algorithm 1.
-    Preset(SelectionPreset),
+    /// [`SelectionPreset::Paper`].
+    Paper,
+    /// [`SelectionPreset::Global`].
+    Global,
+    /// [`SelectionPreset::Scaled`].
+    #[default]
+    Scaled,
     /// Random tokens for every view: a baseline of the presets.
     Random,
 }
 
-impl Default for Selection {
-    fn default() -> Self {
-        Self::Preset(SelectionPreset::default())
-    }
-}
-
-impl fmt::Display for Selection {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Preset(preset) => preset.name(),
-            Self::Random => "random",
-        })
+impl Selection {
+    /// Returns the preset of Algorithm 1; `None` for random tokens.
+    pub fn preset(self) -> Option<SelectionPreset> {
+        match self {
+            Self::Paper => Some(SelectionPreset::Paper),
+            Self::Global => Some(SelectionPreset::Global),
+            Self::Scaled => Some(SelectionPreset::Scaled),
+            Self::Random => None,
+        }
     }
 }
 
@@ -35,29 +38,7 @@ impl FromStr for Selection {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        if name == "random" {
-            return Ok(Self::Random);
-        }
-        let preset = SelectionPreset::ALL.into_iter().find(|preset| preset.name() == name);
-        preset.map(Self::Preset).ok_or_else(|| ModelError::BadConfig {
-            key: "selection",
-            value: name.into(),
-            fix: format!("write one of {}, random", SelectionPreset::ALL.map(SelectionPreset::name).join(", ")),
-        })
-    }
-}
-
-impl TryFrom<String> for Selection {
-    type Error = ModelError;
-
-    fn try_from(name: String) -> Result<Self, ModelError> {
-        name.parse()
-    }
-}
-
-impl From<Selection> for String {
-    fn from(selection: Selection) -> Self {
-        selection.to_string()
+        parse_value("selection", name)
     }
 }
 

@@ -7,12 +7,10 @@
 //! - `training`: training curves
 //! - `scene_list`: the distribution over scenes
 //! - `scene_section`: one scene on the page
-//! - `date`: time of a report
 //! - `tables`: tables of the page
 //! - `page`: the HTML page
 
 pub(crate) mod axis;
-pub(crate) mod date;
 pub(crate) mod html;
 pub(crate) mod page;
 pub(crate) mod plot;

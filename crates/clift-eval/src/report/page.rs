@@ -2,6 +2,7 @@
 
 use std::io;
 use std::path::Path;
+use std::time::SystemTime;
 
 use clift_data::{SkipReport, replace_file};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -12,7 +13,7 @@ use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{count, number};
 use crate::report::plots::plots;
 use crate::report::training::{self, TrainingCurve};
-use crate::report::{date, scene_list, scene_section, tables};
+use crate::report::{scene_list, scene_section, tables};
 use crate::statistics::scene_scores::SceneScores;
 use crate::statistics::summary::{Summary, SummaryPoint};
 
@@ -81,7 +82,7 @@ impl Report {
                     main {
                         h1 { (name) }
                         p.soft {
-                            "clift evaluation, " (date::now())
+                            "clift evaluation, " (httpdate::fmt_http_date(SystemTime::now()))
                             @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
                         }
                         @for warning in self.summary.warnings() { p.warning { "Warning: " (warning) } }

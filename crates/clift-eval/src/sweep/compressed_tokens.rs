@@ -4,7 +4,7 @@
 use burn::tensor::{Tensor, TensorData};
 use clift_data::{Clip, Pose, item_rng};
 use clift_model::{
-    Scene, SceneModel, SceneNormalization, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes,
+    Scene, SceneNormalization, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes,
 };
 use rand::Rng;
 use rand::seq::SliceRandom;

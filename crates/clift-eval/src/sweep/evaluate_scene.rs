@@ -5,7 +5,7 @@ use std::collections::btree_map::Entry;
 use std::time::Instant;
 
 use clift_data::{Clip, derive_seed, median};
-use clift_model::{Cameras, FlopConvention, SceneModel, TokenCoding, Tokens, TrainedModel, Views};
+use clift_model::{Cameras, FlopConvention, TokenCoding, Tokens, TrainedModel, Views};
 
 use crate::config::method::Method;
 use crate::error::EvalError;

@@ -33,12 +33,12 @@ pub(crate) fn select_for_views(
     let target = &clip.target;
     let mut order: Vec<usize> = (0..target.num_views()).collect();
     order.sort_by_key(|&view| target.frame_index[view]);
-    let mut select: Box<dyn FnMut(usize) -> Result<Vec<u32>, ModelError>> = match selection {
-        Selection::Random => Box::new(|view| {
+    let mut select: Box<dyn FnMut(usize) -> Result<Vec<u32>, ModelError>> = match selection.preset() {
+        None => Box::new(|view| {
             let rng = item_rng(seed, view as u64, 0, 0, "random selection");
             Ok(random_subset(ids.len(), num_render_tokens, rng))
         }),
-        Selection::Preset(preset) => {
+        Some(preset) => {
             let context = view_cameras(&clip.context);
             let rays = TokenRay::of_patches(ids, &context, clip.context.height, clip.context.width, patch_size);
             let mut selector = Selector::new(preset.rules(), &rays)?;

@@ -8,19 +8,10 @@ use crate::system::machine::proc_field;
 /// of a training step.
 pub fn keep_freed_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    {
-        use std::ffi::c_int;
-        unsafe extern "C" {
-            fn mallopt(parameter: c_int, value: c_int) -> c_int;
-        }
-        const M_TRIM_THRESHOLD: c_int = -1;
-        const M_MMAP_MAX: c_int = -4;
-        // SAFETY: mallopt is a function of the linked C library; both values are valid (mallopt(3)): never return the end of
-        // the heap, no allocations outside of it.
-        unsafe {
-            mallopt(M_TRIM_THRESHOLD, -1);
-            mallopt(M_MMAP_MAX, 0);
-        }
+    // SAFETY: both values are valid (mallopt(3)): never return the end of the heap, no allocations outside of it.
+    unsafe {
+        libc::mallopt(libc::M_TRIM_THRESHOLD, -1);
+        libc::mallopt(libc::M_MMAP_MAX, 0);
     }
 }
 
@@ -35,13 +26,9 @@ pub fn start_peak() -> Option<()> {
 /// count the memory of the comparison.
 fn release_free_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    {
-        unsafe extern "C" {
-            fn malloc_trim(pad: usize) -> std::ffi::c_int;
-        }
-        // SAFETY: malloc_trim is a function of the linked C library. Any thread may call malloc_trim at any time
-        // (malloc_trim(3)); the call touches only free memory.
-        unsafe { malloc_trim(0) };
+    // SAFETY: any thread may call malloc_trim at any time (malloc_trim(3)); the call touches only free memory.
+    unsafe {
+        libc::malloc_trim(0);
     }
 }
 
@@ -53,7 +40,7 @@ pub fn peak_bytes() -> Option<u64> {
 /// Returns the free memory of a CPU device: that of the system or of the process's control group, whichever is less.
 /// `None` for a GPU and on systems that do not report it.
 pub fn available_bytes(device: DeviceName) -> Option<u64> {
-    if !matches!(device, DeviceName::Flex | DeviceName::Ndarray) {
+    if !device.is_cpu() {
         return None;
     }
     let system = field_bytes("/proc/meminfo", "MemAvailable")?;

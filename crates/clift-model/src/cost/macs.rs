@@ -117,7 +117,16 @@ impl ModelConfig {
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn render_macs(&self, height: usize, width: usize, num_render_tokens: usize) -> Result<Macs, ModelError> {
-        let of_patches = |num_patches| self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
+        self.render_views_macs(height, width, &SceneSizes::new(num_render_tokens, 1, 0))
+    }
+
+    /// Returns the cost of rendering the target views of a scene, as [`render_macs`](Self::render_macs). Views share keys and
+    /// values as `scene` says; its `num_patches` is not read.
+    ///
+    /// # Errors
+    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
+    pub fn render_views_macs(&self, height: usize, width: usize, scene: &SceneSizes) -> Result<Macs, ModelError> {
+        let of_patches = |num_patches| self.macs(Part::Renderer, &SceneSizes { num_patches, ..*scene });
         let grids = self.drawn_patches(height, width)?;
         let mut macs: Macs = grids.iter().map(|&num_patches| of_patches(num_patches)).sum();
         if !self.has_latents() {
@@ -125,7 +134,7 @@ impl ModelConfig {
             macs.linear -= (grids.len() - 1) as u64 * of_patches(0).linear;
         }
         // The paper counts one norm more than the network has.
-        macs.normalized += (grids.iter().sum::<usize>() * self.dim) as u64;
+        macs.normalized += (scene.num_targets * grids.iter().sum::<usize>() * self.dim) as u64;
         Ok(macs)
     }
 

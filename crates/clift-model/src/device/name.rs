@@ -31,6 +31,14 @@ impl DeviceName {
         self.into()
     }
 
+    /// Whether the device computes on the processor, in its memory.
+    pub const fn is_cpu(self) -> bool {
+        match self {
+            Self::Flex | Self::Ndarray => true,
+            Self::Wgpu => false,
+        }
+    }
+
     /// Whether this build contains the device.
     pub fn is_built(self) -> bool {
         match self {

@@ -11,7 +11,6 @@ use crate::network::encoder::Encoder;
 use crate::network::init::Init;
 use crate::network::render_tokens::RenderTokens;
 use crate::network::renderer::Renderer;
-use crate::network::scene_model::SceneModel;
 use crate::network::tokens::Tokens;
 use crate::tokens::clusters::ClusterIndex;
 use crate::views::upload::{Cameras, Views};
@@ -50,38 +49,63 @@ impl Clift {
     pub fn condenser_part() -> PathFilter {
         PathFilter::from_predicate(|path, _| is_condenser(path))
     }
+
+    /// Returns the encoder's output. Stage 2 freezes the encoder, so that both stages of a run have equal features.
+    ///
+    /// # Shapes
+    /// - returns `[batch, num_tokens, dim]`
+    pub fn features(&self, context: &Views) -> Tokens {
+        self.encoder.forward(context)
+    }
+
+    /// Whether [`normalize`](Self::normalize) changes the features.
+    pub fn has_token_norm(&self) -> bool {
+        self.lift_norm.is_norm()
+    }
+
+    /// Returns the tokens that this model compresses and renders.
+    ///
+    /// # Shapes
+    /// - `features` and the result: `[batch, num_tokens, dim]`
+    pub fn normalize(&self, features: Tokens) -> Tokens {
+        let values = self.lift_norm.forward(features.values);
+        Tokens { values, ..features }
+    }
+
+    /// Returns the tokens of context views: [`normalize`](Self::normalize) of the [`features`](Self::features).
+    ///
+    /// # Shapes
+    /// - returns `[batch, num_tokens, dim]`
+    pub fn encode(&self, context: &Views) -> Tokens {
+        self.normalize(self.features(context))
+    }
+
+    /// Writes the tokens of every cluster into one token (paper section 3.2).
+    ///
+    /// # Shapes
+    /// - `tokens`: `[batch, num_tokens, dim]`
+    /// - returns `[batch, num_storage_tokens, dim]`
+    pub fn compress(&self, tokens: Tokens, clusters: &ClusterIndex) -> Tokens {
+        self.condenser.forward(tokens, clusters)
+    }
+
+    /// Renders target views, each the mean of its patch grids.
+    ///
+    /// # Shapes
+    /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
+    pub fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
+        self.renderer.render(tokens, targets)
+    }
+
+    /// Whether a view can be rendered from a subset of the stored tokens.
+    pub fn supports_selection(&self) -> bool {
+        !self.renderer.is_joint()
+    }
 }
 
 /// Whether the parameter at `path` belongs to the condenser.
 pub(crate) fn is_condenser(path: &str) -> bool {
     path.starts_with("condenser.")
-}
-
-impl SceneModel for Clift {
-    fn features(&self, context: &Views) -> Tokens {
-        self.encoder.forward(context)
-    }
-
-    fn has_token_norm(&self) -> bool {
-        self.lift_norm.is_norm()
-    }
-
-    fn normalize(&self, features: Tokens) -> Tokens {
-        let values = self.lift_norm.forward(features.values);
-        Tokens { values, ..features }
-    }
-
-    fn compress(&self, tokens: Tokens, clusters: &ClusterIndex) -> Tokens {
-        self.condenser.forward(tokens, clusters)
-    }
-
-    fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
-        self.renderer.render(tokens, targets)
-    }
-
-    fn supports_selection(&self) -> bool {
-        !self.renderer.is_joint()
-    }
 }
 
 #[cfg(test)]

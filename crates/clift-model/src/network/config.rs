@@ -34,8 +34,8 @@ pub struct ModelConfig {
     /// How attention knows the cameras.
     #[serde(skip_serializing_if = "is_default")]
     pub camera_encoding: CameraEncoding,
-    /// Number of drawings, with patches shifted by half a patch, whose mean is an image: 1, 2 or 4. Training draws an image
-    /// once.
+    /// Number of renderings, with patches shifted by half a patch, whose mean is an image: 1, 2 or 4. Training renders an
+    /// image once.
     #[serde(skip_serializing_if = "is_default")]
     pub patch_grids: PatchGrids,
     /// The condenser of stage 2.
@@ -160,7 +160,7 @@ impl ModelConfig {
     ///
     /// # Errors
     /// As [`num_patches`](Self::num_patches).
-    pub fn drawn_patches(&self, height: usize, width: usize) -> Result<Vec<usize>, ModelError> {
+    pub(crate) fn drawn_patches(&self, height: usize, width: usize) -> Result<Vec<usize>, ModelError> {
         self.num_patches(1, height, width)?;
         let patches = self.patch_grids.patches([height, width].map(|side| side / self.patch_size));
         Ok(patches.map(|[rows, columns]| rows * columns).collect())

@@ -3,7 +3,7 @@
 //! Read in this order: `architecture` and `config` name a network and its sizes; `encoder` makes light-field tokens of
 //! context views; `condenser` (equations 1 to 4) writes every cluster of tokens into its centroid, and
 //! `released_condenser` is the one of the published checkpoints; `render_tokens` holds the tokens of target views, and
-//! `renderer` decodes images from them; `clift` joins the three networks behind the interface of `scene_model`.
+//! `renderer` decodes images from them; `clift` joins the three networks.
 //!
 //! In the encoder-decoder of LVSM, a baseline, the `encoder` encodes learned latents beside the patches, and the `renderer`
 //! decodes with `joint_decoder`.
@@ -26,5 +26,4 @@ pub(crate) mod layers;
 pub(crate) mod released_condenser;
 pub(crate) mod render_tokens;
 pub(crate) mod renderer;
-pub(crate) mod scene_model;
 pub(crate) mod tokens;

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
+use crate::cost::memory::render_bytes;
 use crate::error::ModelError;
 use crate::network::camera_encoding::TransformMaker;
 use crate::network::config::ModelConfig;
@@ -33,13 +34,13 @@ pub fn frames_per_call(num_patches: usize) -> usize {
     (PATCHES_PER_CALL / num_patches.max(1)).clamp(1, FRAMES_PER_CALL)
 }
 
-/// Returns the number of images that a frame of a scene is interleaved from, and the patches of all of them on the largest
-/// grid.
-pub fn drawn_images(model: &ModelConfig, trained_height: usize, height: usize, width: usize) -> [usize; 2] {
-    let (k, size) = parts(trained_height, model.patch_size, [height, width]);
+/// Returns the peak bytes of tensors, without weights, while one call renders frames of a scene with the network `model`.
+pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [height, width]: [usize; 2]) -> u64 {
+    let (k, size) = parts(scene.height, model.patch_size, [height, width]);
     let grids = model.patch_grids.patches(size.map(|side| side / model.patch_size));
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
-    [k * k, k * k * largest]
+    let num_images = k * k * num_frames;
+    render_bytes(model, scene.num_tokens(), num_images, num_images * largest)
 }
 
 /// Reads the renderer of a scene from a weight file.

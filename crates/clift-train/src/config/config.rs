@@ -88,7 +88,7 @@ impl Config {
             model: model.clone(),
             lpips: None,
             external_methods: Vec::new(),
-            is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
+            is_cpu: device.is_cpu(),
             seed: derive_seed(*seed, "eval"),
         }
     }

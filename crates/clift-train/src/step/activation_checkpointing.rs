@@ -7,7 +7,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
-use clift_model::{Cameras, Clift, EncoderBlock, SceneModel, Tokens, Views};
+use clift_model::{Cameras, Clift, EncoderBlock, Tokens, Views};
 
 use crate::error::TrainError;
 use crate::step::batch::TokenSelection;

@@ -4,7 +4,7 @@
 use burn::tensor::{Device, Tensor};
 use clift_data::Clip;
 use clift_eval::{upload_cameras, upload_images, upload_views};
-use clift_model::{Cameras, Clift, SceneModel, Views};
+use clift_model::{Cameras, Clift, Views};
 
 use crate::error::TrainError;
 use crate::step::batch::TokenSelection;

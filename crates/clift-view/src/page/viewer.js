@@ -331,8 +331,8 @@ function updateLabels() {
   $("seconds-value").textContent = `${path.seconds} s`;
   $("contexts-hint").textContent = {
     none: view.scene.has_true_images ? "The images that were compressed." : "Rendered from all tokens: a scene file holds no images.",
-    selected: "Framed: stored tokens; bright: the tokens of this picture.",
-    clusters: "One color per stored token; strong: the tokens of this picture.",
+    selected: "Framed: stored tokens; bright: the tokens of this image.",
+    clusters: "One color per stored token; strong: the tokens of this image.",
   }[view.overlay];
   for (const slider of document.querySelectorAll("input[type=range]")) {
     slider.style.setProperty("--filled", `${(100 * (slider.value - slider.min)) / Math.max(1, slider.max - slider.min)}%`);

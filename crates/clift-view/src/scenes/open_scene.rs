@@ -3,9 +3,7 @@
 use burn::tensor::Device;
 use clift_data::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
 use clift_eval::{Canvas, available_bytes};
-use clift_model::{
-    DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, ViewCamera, drawn_images, render_bytes,
-};
+use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, ViewCamera, frame_bytes};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};
@@ -137,8 +135,7 @@ fn sizes(scene: &Scene, device: DeviceName) -> Vec<[usize; 2]> {
         .map(|factor| own.map(|side| ((side as f64 * factor / patch as f64).round() as usize).max(1) * patch))
         .filter(|size| *size == own || (is_similar(*size, own) && size.iter().all(|side| *side <= MAX_SIDE_PX)))
         .filter(|size| {
-            let [images, patches] = drawn_images(&scene.model, scene.height, size[1], size[0]);
-            let needed = render_bytes(&scene.model, scene.num_tokens(), images, patches);
+            let needed = frame_bytes(scene, &scene.model, 1, [size[1], size[0]]);
             *size == own || available_bytes(device).is_none_or(|available| needed <= available / 2)
         })
         .collect();

@@ -15,7 +15,7 @@ pub(crate) const CASES: &[StabilityCase] = &[
         name: "tokens in f32",
         breaks: "the way to a file and back",
         bound: Bound::Most(1e-5),
-        reason: "nothing is rounded; of pictures, whose values are below 1",
+        reason: "nothing is rounded; of images, whose values are below 1",
         run: |devices| render_error(devices, TokenFormat::F32),
     },
     StabilityCase {

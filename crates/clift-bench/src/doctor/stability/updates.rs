@@ -71,13 +71,13 @@ pub(crate) const CASES: &[StabilityCase] = &[
             }
         })
     }),
-    gradient_case("black pictures", "patches that are constant, a target at the edge of the sigmoid", |devices| {
+    gradient_case("black images", "patches that are constant, a target at the edge of the sigmoid", |devices| {
         changed_views(devices, 4, |clip| paint(clip, |_| 0))
     }),
-    gradient_case("white pictures", "the same at its other edge", |devices| {
+    gradient_case("white images", "the same at its other edge", |devices| {
         changed_views(devices, 4, |clip| paint(clip, |_| 255))
     }),
-    gradient_case("saturated pictures: every value 0 or 255", "the largest differences there can be", |devices| {
+    gradient_case("saturated images: every value 0 or 255", "the largest differences there can be", |devices| {
         changed_views(devices, 4, |clip| paint(clip, |value| if value > 127 { 255 } else { 0 }))
     }),
     gradient_case("1 context", "nothing to attend to in other views", |devices| changed_views(devices, 1, |_| ())),

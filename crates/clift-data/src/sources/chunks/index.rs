@@ -13,7 +13,7 @@ use crate::skip_report::{SkipReport, first_few, note_on, plural};
 use crate::sources::chunks::table::ChunkTable;
 use crate::sources::test_scenes::TestScenes;
 
-/// List of the reference implementation, beside one file per scene: keys of scenes whose images have another size.
+/// List of the authors' released code, beside one file per scene: keys of scenes whose images have another size.
 const INVALID_KEYS: &str = "invalid_keys.txt";
 
 /// Reads `index.json`: file names by scene key.

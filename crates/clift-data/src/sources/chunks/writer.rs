@@ -149,7 +149,7 @@ pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>
     pack(path, pickle)
 }
 
-/// Returns the bytes of the file at `path` with one scene, as in the reference implementation.
+/// Returns the bytes of the file at `path` with one scene, as in the authors' released code.
 pub(crate) fn scene_file_bytes(path: &Path, scene: &SceneRecord) -> Result<Vec<u8>, DataError> {
     let mut pickle = PickleWriter::new();
     write_scene(scene, &mut pickle);

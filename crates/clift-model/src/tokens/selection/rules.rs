@@ -64,9 +64,8 @@ impl FromStr for SelectionPreset {
 /// Distance of tokens to grid cells, tokens per cell, and the size of cells. The default is Algorithm 1 of the paper.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SelectionRules {
-    /// Weight of the angle between the rays of token and cell, in radians.
-    pub angle_weight: f32,
-    /// Weight of the distance between the cameras of token and target, in normalized units.
+    /// Weight of the distance between the cameras of token and target, in normalized units, beside the angle between the
+    /// rays of token and cell, in radians.
     pub distance_weight: f32,
     /// Subtracted from the distance of a token selected for the previous frame.
     pub previous_bonus: f32,
@@ -85,7 +84,6 @@ pub struct SelectionRules {
 impl Default for SelectionRules {
     fn default() -> Self {
         Self {
-            angle_weight: 1.0,
             distance_weight: 0.02,
             previous_bonus: 0.03,
             momentum: 0.5,

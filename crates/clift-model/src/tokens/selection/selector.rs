@@ -136,7 +136,7 @@ impl Selector {
     /// Updates the smoothed distances of all tokens to all cells and returns the nearest tokens.
     fn measure(&mut self, cells: &[[f64; 3]], grid: [usize; 2], target: [f64; 3], per_cell: usize) -> Nearest {
         let num_tokens = self.origins.len();
-        let SelectionRules { angle_weight, momentum, .. } = self.rules;
+        let SelectionRules { momentum, .. } = self.rules;
         let offsets = self.offsets(target);
         let keeps_field = momentum > 0.0;
         let momentum = if self.grid == grid { momentum } else { 0.0 };
@@ -149,7 +149,7 @@ impl Selector {
         let weigh = |mut found: Nearest, (cell, kept): (&[f64; 3], &mut Vec<f32>)| {
             let mut scratch = std::mem::take(&mut found.row);
             let row = if keeps_field { kept } else { &mut scratch };
-            directions.add_distances(cell.map(|v| v as f32), angle_weight, &offsets, momentum, row);
+            directions.add_distances(cell.map(|v| v as f32), &offsets, momentum, row);
             for (nearest, &distance) in found.distance.iter_mut().zip(row.iter()) {
                 *nearest = if distance < *nearest { distance } else { *nearest };
             }
@@ -175,15 +175,15 @@ impl Selector {
 }
 
 impl Directions {
-    /// Replaces a row by `(1 - momentum) * (angle_weight * angle + offset) + momentum * row`.
-    fn add_distances(&self, cell: [f32; 3], angle_weight: f32, offsets: &[f32], momentum: f32, row: &mut [f32]) {
+    /// Replaces a row by `(1 - momentum) * (angle + offset) + momentum * row`.
+    fn add_distances(&self, cell: [f32; 3], offsets: &[f32], momentum: f32, row: &mut [f32]) {
         let Self { x, y, z } = self;
         let (count, keep) = (row.len(), 1.0 - momentum);
         // Slices of visibly equal length let the compiler omit bounds checks and vectorize.
         let (x, y, z, offsets) = (&x[..count], &y[..count], &z[..count], &offsets[..count]);
         for i in 0..count {
             let (dx, dy, dz) = (x[i] - cell[0], y[i] - cell[1], z[i] - cell[2]);
-            let distance = angle_weight * angle(dx * dx + dy * dy + dz * dz) + offsets[i];
+            let distance = angle(dx * dx + dy * dy + dz * dz) + offsets[i];
             row[i] = keep * distance + momentum * row[i];
         }
     }

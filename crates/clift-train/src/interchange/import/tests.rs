@@ -5,8 +5,8 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::{Device, Tensor};
 use clift_data::write_state_dict;
 use clift_model::{
-    Cameras, Clift, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, SceneModel, TrainedModel,
-    Views, save_weights,
+    Cameras, Clift, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, TrainedModel, Views,
+    save_weights,
 };
 use half::f16;
 use safetensors::SafeTensors;

@@ -36,7 +36,7 @@ pub struct RenderArgs {
     /// Select rendered tokens by this rule: paper, global or scaled
     #[arg(long, value_name = "PRESET", default_value = "scaled")]
     pub selection: SelectionPreset,
-    /// Average 1, 2 or 4 drawings with shifted patches [default: the model's]
+    /// Average 1, 2 or 4 renderings with shifted patches [default: the model's]
     #[arg(long, value_name = "COUNT")]
     pub patch_grids: Option<PatchGrids>,
     /// Width and height of a frame in pixels, multiples of the patch [default: context]

@@ -10,7 +10,7 @@ use clift_data::{
 use clift_eval::available_bytes;
 use clift_model::{
     DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, RenderBudget, Scene, SceneRenderer,
-    ViewCamera, drawn_images, frames_per_call, load_renderer, render_bytes,
+    ViewCamera, frame_bytes, frames_per_call, load_renderer,
 };
 use serde::Serialize;
 
@@ -142,8 +142,7 @@ fn check_size(
     let num_patches = model.num_patches(1, height, width)?;
     // With token selection every frame has its own tokens and is rendered alone.
     let num_frames = if selects { 1 } else { frames_per_call(num_patches) };
-    let [images, patches] = drawn_images(model, scene.height, height, width);
-    let needed = render_bytes(model, scene.num_tokens(), images * num_frames, patches * num_frames);
+    let needed = frame_bytes(scene, model, num_frames, [height, width]);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (file_size(needed), file_size(available));
         usage_bail!(

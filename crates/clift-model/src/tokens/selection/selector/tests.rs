@@ -61,8 +61,7 @@ impl BruteForce {
             for (s, ray) in self.rays.iter().enumerate() {
                 let cosine: f64 = unit(ray.direction).iter().zip(cell).map(|(a, b)| a * b).sum();
                 let apart: f64 = ray.origin.iter().zip(camera.origin()).map(|(a, b)| (a - b).powi(2)).sum();
-                let mut distance = f64::from(rules.angle_weight) * cosine.clamp(-1.0, 1.0).acos()
-                    + f64::from(rules.distance_weight) * apart.sqrt();
+                let mut distance = cosine.clamp(-1.0, 1.0).acos() + f64::from(rules.distance_weight) * apart.sqrt();
                 if let Some((previous, chosen)) = self.frames.last() {
                     if chosen.contains(&s) {
                         distance -= f64::from(rules.previous_bonus);
