@@ -22,6 +22,7 @@
 #![expect(clippy::inline_always, reason = "only code inlined into a kernel is compiled with the kernel's instructions")]
 
 mod attention;
+mod bf16_values;
 mod cluster_attention;
 mod gelu;
 mod head_transform;
@@ -37,6 +38,8 @@ mod testing;
 pub use simd::dispatch::{InstructionSet, InstructionSetError, OperandType};
 // The bound of every product
 pub use simd::peak::peak_flops;
+// Values in bf16
+pub use bf16_values::{pack_bf16, unpack_bf16};
 // Softmax attention
 pub use attention::backward::{BackwardInputs, attention_backward};
 pub use attention::forward::attention_forward;

@@ -21,6 +21,7 @@ use crate::ops::gelu::GeluKernels;
 use crate::ops::layer_norm::{LayerNormKernels, NormState};
 use crate::ops::mac_counter;
 use crate::ops::precision::{MatmulKernels, Precision};
+use crate::ops::saved::{SaveKernels, Saved};
 
 /// Computes `x W + b`, with `b = 0` for a layer without bias.
 ///
@@ -117,7 +118,7 @@ pub trait LinearOps: Backend {
 }
 
 /// Parts of the operations on a backend. The default implementations run on every backend.
-pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels {
+pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels + SaveKernels {
     /// Computes `x W + b`: `[B, N, I] -> [B, N, O]`.
     fn linear_output(precision: Precision, inputs: [FloatTensor<Self>; 3]) -> FloatTensor<Self> {
         composed_output::<Self>(precision, inputs)
@@ -236,6 +237,8 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
                 let output = forward::<B>([x.clone(), weight.clone(), bias], prologue);
+                // The result of attention, the input of other layers, is saved by the attention, too.
+                let x = if prologue.gelu { B::save(prologue.precision, x) } else { Saved::whole(x) };
                 prep.finish(LinearState { x, weight, prologue }, output)
             }
             OpsKind::UnTracked(prep) => prep.finish(forward::<B>([x, weight, bias], prologue)),
@@ -271,7 +274,7 @@ struct LinearBackward;
 
 #[derive(Clone, Debug)]
 struct LinearState<T> {
-    x: T,
+    x: Saved<T>,
     weight: T,
     prologue: Prologue,
 }
@@ -284,6 +287,7 @@ impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
         register::<B, _, 3>(ops, grads, |LinearState { x, weight, prologue }, grad, needed| {
             let Prologue { gelu, precision } = prologue;
             let [of_x, of_weight, of_bias] = needed;
+            let x = B::restore(x);
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {
                 let activation = if gelu { B::gelu_output(x.clone()) } else { x.clone() };

@@ -4,7 +4,8 @@
 //! - `autodiff`: gradients of an operation for its inputs
 //! - `flex`: tensors of Burn's CPU backend as f32 slices
 //! - `mac_counter`: multiply-accumulates, counted in tests
-//! - `precision`: f32 or f16 operands of matrix products, per scope
+//! - `precision`: f32, bf16 or f16 operands of matrix products, per scope
+//! - `saved`: tensors that are saved for the backward, in bf16 where that loses nothing
 //!
 //! Operations:
 //! - `gelu`: GELU with exact gradient
@@ -24,3 +25,4 @@ pub(crate) mod layer_norm;
 pub(crate) mod linear;
 pub(crate) mod mac_counter;
 pub(crate) mod precision;
+pub(crate) mod saved;

@@ -2,7 +2,8 @@
 //!
 //! Only the two operands of a product are rounded, in linear layers and attention, forward and backward. Weights, results,
 //! sums, norms, softmax, GELU, loss, gradients and optimizer state stay f32, as do the first layers, whose inputs are
-//! rays, and the attention inside clusters with its gates.
+//! rays, and the attention inside clusters with its gates. In bf16, queries, keys, values and the input of GELU are also saved
+//! for the backward in bf16 ([`saved`](crate::ops::saved)).
 //!
 //! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
 //! forward pass. An operation reads the precision once; its backward uses that of its forward.

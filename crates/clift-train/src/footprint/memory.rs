@@ -83,6 +83,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         num_scenes,
         is_accumulated: num_scenes < settings.batch_size,
         activation_checkpointing: config.activation_checkpointing,
+        precision: config.precision,
         matrix_moments: settings.optimizer.algorithm.matrix_moments(),
         scene: largest_sizes(config, stage)?,
         num_image_values,

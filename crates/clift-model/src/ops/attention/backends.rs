@@ -12,6 +12,7 @@ use clift_kernels::{
 use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, composed_forward};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
 use crate::ops::precision::MatmulKernels;
+use crate::ops::saved::SaveKernels;
 
 impl AttentionKernels for Flex {
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
@@ -19,7 +20,7 @@ impl AttentionKernels for Flex {
         let Some(operands) = precision.native_operands().filter(|_| inputs.is_native()) else {
             return composed_forward::<Self>(inputs, heads);
         };
-        let inputs = inputs.clone().contiguous();
+        let inputs = inputs.clone().map(contiguous);
         let sizes = inputs.sizes(num_heads);
         let AttentionSizes { batch, num_queries, head_width, .. } = sizes;
         let dim = num_heads * head_width;
@@ -41,7 +42,7 @@ impl AttentionKernels for Flex {
         let (Some(log_sum), Some(operands)) = (attended.log_sum, precision.native_operands()) else {
             return composed_backward::<Self>(&inputs, attended.output, heads, grad_output);
         };
-        let inputs = inputs.contiguous();
+        let inputs = inputs.map(contiguous);
         let sizes = inputs.sizes(num_heads);
         let AttentionSizes { batch, num_queries, num_keys, head_width, .. } = sizes;
         let dim = num_heads * head_width;
@@ -76,15 +77,6 @@ impl Qkv<FlexTensor> {
         }
     }
 
-    fn contiguous(self) -> Self {
-        match self {
-            Self::Packed(packed) => Self::Packed(contiguous(packed)),
-            Self::Separate { query, key_value } => {
-                Self::Separate { query: contiguous(query), key_value: contiguous(key_value) }
-            }
-        }
-    }
-
     fn sizes(&self, num_heads: usize) -> AttentionSizes {
         let (query, key_value, parts) = match self {
             Self::Packed(packed) => (packed, packed, 3),
@@ -111,7 +103,7 @@ fn columns(x: &FlexTensor, first: usize) -> StridedRows<'_> {
 }
 
 /// Attention and its gradients on a backend. The default implementations run on every backend.
-pub trait AttentionKernels: MatmulKernels {
+pub trait AttentionKernels: MatmulKernels + SaveKernels {
     /// Computes the output, and the log sums if the native kernel runs.
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
         composed_forward::<Self>(inputs, heads)

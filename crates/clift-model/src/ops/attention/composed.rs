@@ -32,6 +32,17 @@ pub enum Qkv<T> {
     },
 }
 
+impl<T> Qkv<T> {
+    pub(crate) fn map<U>(self, function: impl Fn(T) -> U) -> Qkv<U> {
+        match self {
+            Self::Packed(packed) => Qkv::Packed(function(packed)),
+            Self::Separate { query, key_value } => {
+                Qkv::Separate { query: function(query), key_value: function(key_value) }
+            }
+        }
+    }
+}
+
 #[derive(Clone, Debug)]
 pub struct AttentionOutput<T> {
     /// Output, `[B, Q, D]`.

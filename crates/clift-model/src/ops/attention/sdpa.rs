@@ -17,6 +17,7 @@ use crate::ops::attention::backends::AttentionKernels;
 use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv};
 use crate::ops::autodiff::register;
 use crate::ops::mac_counter;
+use crate::ops::saved::Saved;
 
 /// Computes attention among the tokens of a scene, `softmax(q k^T / sqrt(head width)) v`, unmasked.
 ///
@@ -113,19 +114,20 @@ struct SdpaBackward;
 
 #[derive(Clone, Debug)]
 struct SdpaState<T> {
-    inputs: Qkv<T>,
+    inputs: Qkv<Saved<T>>,
     attended: AttentionOutput<T>,
     heads: HeadConfig,
 }
 
 impl<T> SdpaState<T> {
     fn backward<B: AttentionKernels<FloatTensorPrimitive = T>>(self, grad_output: T) -> Qkv<T> {
-        B::attend_backward(self.inputs, self.attended, self.heads, grad_output)
+        B::attend_backward(self.inputs.map(B::restore), self.attended, self.heads, grad_output)
     }
 }
 
 fn attend<B: AttentionKernels>(inputs: Qkv<FloatTensor<B>>, heads: HeadConfig) -> SdpaState<FloatTensor<B>> {
-    SdpaState { attended: B::attend(&inputs, heads), inputs, heads }
+    let attended = B::attend(&inputs, heads);
+    SdpaState { inputs: inputs.map(|x| B::save(heads.precision, x)), attended, heads }
 }
 
 impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
