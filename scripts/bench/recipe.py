@@ -47,9 +47,6 @@ TRAINED = {
     "whole": [],
     "whole, 5 targets a scene": ["data.views.num_targets=5"],
     "whole, 4 scenes of 6 targets": ["data.views.num_targets=6", "stage1.batch_size=4"],
-    "whole, 2 targets a scene": ["data.views.num_targets=2"],
-    "whole, learning rate 3e-3": ["stage1.optimizer.learning_rate=3e-3"],
-    "whole, learning rate 9e-3": ["stage1.optimizer.learning_rate=9e-3"],
 }
 # Drawn on one patch grid, which training does not depend on; the config's own number comes last.
 VARIANTS = {name: [*changes, "model.patch_grids=1"] for name, changes in TRAINED.items()} | {"whole, patch grids": []}
