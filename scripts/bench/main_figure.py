@@ -4,8 +4,8 @@
 Trains CLiFT, then LVSM for every number of latents twice: for as many steps as both stages of CLiFT together, and for as
 long as their steps took. Further seeds train CLiFT and the smallest LVSM. Every seed is evaluated with `clift eval
 --preset main --with ..`; the tables have PSNR with its standard error (over seeds, where there are several, else over
-scenes), tokens, values, bytes, GMAC and measured time a view. Keep the machine quiet: the second table depends on the
-times of steps. Trainings resume; finished ones are kept.
+scenes), tokens, values, bytes, GMAC and measured time a view; main-figure.svg draws PSNR over tokens. Keep the machine
+quiet: the second table depends on the times of steps. Trainings resume; finished ones are kept.
 
     python3 scripts/bench/main_figure.py --out runs/main-figure                      # hours on two cores
     python3 scripts/bench/main_figure.py --clift-config configs/tiny.toml --lvsm-config configs/lvsm-ed-tiny.toml \\
@@ -18,9 +18,13 @@ import argparse
 import json
 import statistics
 import subprocess
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts" / "tools"))
+from plot_runs import svg
+
 FORMATS = ["f16", "coded", "coded-0.1"]
 
 
@@ -89,6 +93,26 @@ def table(title: str, evaluations: list[list[dict]]) -> None:
         )
 
 
+def curve(evaluations: list[list[dict]], variant: str) -> list[tuple[float, float]]:
+    """Mean PSNR of a method in f16 by the number of stored tokens."""
+    found: dict[int, list[float]] = {}
+    for point in (point for points in evaluations for point in points):
+        if point["variant"] == variant and point["tokens"] == "f16":
+            found.setdefault(point["num_storage_tokens"], []).append(point["psnr"])
+    return sorted((tokens, statistics.fmean(psnr)) for tokens, psnr in found.items())
+
+
+def plot(out: Path, evaluations: dict[str, list[list[dict]]]) -> None:
+    curves = {
+        "CLiFT, one training": curve(evaluations["steps"], "clift"),
+        "LVSM-ED, a training for each size, equal time": curve(evaluations["time"], "lvsm_ed"),
+        "LVSM-ED, a training for each size, equal steps": curve(evaluations["steps"], "lvsm_ed"),
+    }
+    tokens = [x for x, _ in curves["CLiFT, one training"]]
+    y_ticks = {half / 2: f"{half / 2:g}" for half in range(120)}
+    out.write_text(svg(curves, tokens, y_ticks, ("stored tokens", "PSNR, dB"), "bottom"))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="The paper's main figure, CLiFT against LVSM-ED.")
     parser.add_argument("--exe", type=Path, default=ROOT / "target/release/clift")
@@ -123,6 +147,7 @@ def main() -> None:
             print(f"seed {seed}, equal {kind}: {sizes}")
     for kind, points in evaluations.items():
         table(f"Equal {kind}", points)
+    plot(figure.out / "main-figure.svg", evaluations)
 
 
 if __name__ == "__main__":

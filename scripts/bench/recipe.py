@@ -48,7 +48,7 @@ TRAINED = {
     "whole, 5 targets a scene": ["data.views.num_targets=5"],
     "whole, 4 scenes of 6 targets": ["data.views.num_targets=6", "stage1.batch_size=4"],
 }
-# Drawn on one patch grid, which training does not depend on; the config's own number comes last.
+# Rendered on one patch grid, which training does not depend on; the config's own number comes last.
 VARIANTS = {name: [*changes, "model.patch_grids=1"] for name, changes in TRAINED.items()} | {"whole, patch grids": []}
 
 

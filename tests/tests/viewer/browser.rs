@@ -176,7 +176,7 @@ fn viewer_screenshots() {
         }
     }
     // The picture of the documents: true image beside rendering, from most of all tokens.
-    browser.emulate([1240, 880], 1.0, false, "light");
+    browser.emulate([1240, 904], 1.0, false, "light");
     browser.open(&viewer.url);
     rest_after(&mut browser, 0);
     let number = std::env::var("CLIFT_VIEW_NUMBER").unwrap_or_else(|_| "0".into());

@@ -2,7 +2,7 @@
 
 use std::io;
 use std::path::Path;
-use std::time::SystemTime;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use clift_data::{SkipReport, replace_file};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -82,7 +82,7 @@ impl Report {
                     main {
                         h1 { (name) }
                         p.soft {
-                            "clift evaluation, " (httpdate::fmt_http_date(SystemTime::now()))
+                            "clift evaluation, " (httpdate::fmt_http_date(SystemTime::now().max(UNIX_EPOCH)))
                             @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
                         }
                         @for warning in self.summary.warnings() { p.warning { "Warning: " (warning) } }

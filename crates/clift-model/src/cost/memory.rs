@@ -56,7 +56,7 @@ pub struct UpdateSizes {
     pub is_accumulated: bool,
     /// Whether every block stores only its input and recomputes the rest.
     pub activation_checkpointing: bool,
-    /// Precision of matrix products: attention and feed-forward networks save their inputs in bf16 where they compute in bf16.
+    /// Precision of matrix products. In bf16 attention saves its inputs in bf16, a feed-forward network the input of its GELU.
     pub precision: Precision,
     /// Moments per value of a block's weight matrices: two with `AdamW`, one with Muon.
     pub matrix_moments: usize,
@@ -165,7 +165,12 @@ fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_train
             }
         };
         saved += if layer.saves_input { input } else { 0.0 };
-        let is_rounded = matches!(layer.kind, LayerKind::Activation { .. } | LayerKind::Attention { .. });
+        let is_rounded = match layer.kind {
+            LayerKind::Attention { .. } => true,
+            // The condenser of the released code has ReLU, which is no operation of its own.
+            LayerKind::Activation { .. } => layer.part != Part::Condenser || !config.has_released_condenser(),
+            _ => false,
+        };
         if *precision == Precision::Bf16 && is_rounded {
             (in_bf16, restored) = (in_bf16 + input, restored.max(input));
         }

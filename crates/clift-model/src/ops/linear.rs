@@ -237,7 +237,7 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
                 let output = forward::<B>([x.clone(), weight.clone(), bias], prologue);
-                // The result of attention, the input of other layers, is saved by the attention, too.
+                // Other inputs may be held by other operations, too: the result of attention, the tokens of a scene.
                 let x = if prologue.gelu { B::save(prologue.precision, x) } else { Saved::whole(x) };
                 prep.finish(LinearState { x, weight, prologue }, output)
             }

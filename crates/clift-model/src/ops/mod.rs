@@ -5,7 +5,7 @@
 //! - `flex`: tensors of Burn's CPU backend as f32 slices
 //! - `mac_counter`: multiply-accumulates, counted in tests
 //! - `precision`: f32, bf16 or f16 operands of matrix products, per scope
-//! - `saved`: tensors that are saved for the backward, in bf16 where that loses nothing
+//! - `saved`: tensors that are saved for the backward, in bf16 where the precision is bf16
 //!
 //! Operations:
 //! - `gelu`: GELU with exact gradient

@@ -25,7 +25,8 @@ impl<T> Saved<T> {
 
 /// Saving on a backend. The default implementations save tensors as they are.
 pub trait SaveKernels: Backend {
-    /// Saves a tensor that the products of the backward round to `precision`: in bf16 on `flex`, half of its memory.
+    /// Saves a tensor, on `flex` with the precision bf16 in half of its memory: without loss for operands of products, which are
+    /// rounded anyway; the input of GELU is rounded.
     fn save(_precision: Precision, x: FloatTensor<Self>) -> Saved<FloatTensor<Self>> {
         Saved::whole(x)
     }
