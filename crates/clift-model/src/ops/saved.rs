@@ -38,6 +38,7 @@ pub trait SaveKernels: Backend {
 }
 
 impl SaveKernels for Flex {
+    // Not by Burn's cast, which converts value by value in one thread.
     fn save(precision: Precision, x: FloatTensor<Self>) -> Saved<FloatTensor<Self>> {
         if precision != Precision::Bf16 || !is_native(&x) {
             return Saved::whole(x);

@@ -1,7 +1,7 @@
 //! Images averaged over shifted grids of patches ("cycle spinning", Coifman and Donoho 1995).
 //!
 //! The last layer makes the pixels of a patch from the token of that patch alone, which leaves seams between patches. An image
-//! that is drawn again with its patches elsewhere has its seams elsewhere. In the mean, weighted by the distance from the
+//! that is rendered again with its patches elsewhere has its seams elsewhere. In the mean, weighted by the distance from the
 //! seams, they are faint.
 // B scenes, V views, H rows, W columns
 
