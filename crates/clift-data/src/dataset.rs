@@ -81,9 +81,7 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
 /// As [`open_dataset`].
 pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<OpenedSource, DataError> {
     let mut opened = open_dataset(config, Split::Train)?;
-    if opened.shares_scenes && config.hold_out > 0 {
-        opened.source = Arc::new(SceneSubset::without_held_out(opened.source, config.hold_out));
-    }
+    opened.source = opened.training_source(config.hold_out);
     let source = opened.source.clone();
     let needed = config.views.min_frames(last_step);
     // An unreadable scene is reported when it is sampled.

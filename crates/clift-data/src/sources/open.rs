@@ -18,6 +18,7 @@ use crate::sources::options::SourceOptions;
 use crate::sources::photos::photo::PhotoOptions;
 use crate::sources::photos::photo_source::{PhotoSource, PhotoSourceOptions};
 use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder};
+use crate::sources::subset::SceneSubset;
 use crate::sources::test_scenes::{KEPT_AND_ABSENT, TestScenes};
 
 /// Image folders of DL3DV scenes, by preference: 480 x 270, then larger.
@@ -41,6 +42,16 @@ pub struct OpenedSource {
     pub shares_scenes: bool,
     /// Skipped scenes and frames.
     pub report: SkipReport,
+}
+
+impl OpenedSource {
+    /// The frames that training may read: all, or without one in `hold_out` where both splits are the same scenes.
+    pub fn training_source(&self, hold_out: usize) -> Arc<dyn SceneSource> {
+        match self.shares_scenes && hold_out > 0 {
+            true => Arc::new(SceneSubset::without_held_out(self.source.clone(), hold_out)),
+            false => self.source.clone(),
+        }
+    }
 }
 
 /// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` if it has neither. `root` may be a data

@@ -75,14 +75,17 @@ fn describe_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
                 let frames = EvalFrames::new(&opened, split, data.hold_out, true);
                 report.evaluation = Some(evaluation(config, opened.source.clone(), frames));
             }
-            let OpenedSource { source, report: skips, .. } = opened;
-            let source: Arc<dyn SceneSource> = match data.source {
-                SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
-                _ => source,
+            let first = |source| -> Arc<dyn SceneSource> {
+                match data.source {
+                    SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
+                    _ => source,
+                }
             };
-            let mut described = describe_split(source.as_ref(), &skips)?;
+            let training = first(opened.training_source(data.hold_out));
+            let OpenedSource { source, report: skips, .. } = opened;
+            let mut described = describe_split(first(source).as_ref(), &skips)?;
             if split == Split::Train {
-                described.views = Some(long_enough(config, source.as_ref()));
+                described.views = Some(long_enough(config, training.as_ref()));
             }
             Ok(described)
         });
@@ -117,7 +120,7 @@ fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
     described.unwrap_or_else(|error| SplitReport { error: Some(error.to_string()), ..Default::default() })
 }
 
-/// Returns the frames that `data.views` needs, and the number of scenes that have them.
+/// Returns the frames that `data.views` needs at the last step, and the number of scenes with as many training frames.
 fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
     let needed = config.data.views.min_frames(config.stage1.steps);
     let mut num_long = 0;
@@ -187,7 +190,7 @@ test              1 scene
         config.data.filters.min_frames = 8;
         config.eval.index = Some(fixtures().join("evaluation_index.json"));
         let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
-        assert!(text.contains("  long enough     0 of 2: data.views.min_gap needs 46 frames"), "{text}");
+        assert!(text.contains("  long enough     0 of 2: data.views.min_gap needs 46 training frames"), "{text}");
         assert!(
             text.contains("evaluation        4 views of 1 scene, test split\n  skipped         2 without views"),
             "{text}"
@@ -204,17 +207,40 @@ test              1 scene
         assert!(report.evaluation.is_none());
     }
 
+    fn write_capture(folder: &Path, width: usize, num_photos: usize) {
+        std::fs::create_dir(folder).unwrap();
+        let image = RgbImage { width, height: 24, rgb: vec![9; width * 24 * 3] };
+        let mut frames = Vec::new();
+        for photo in 0..num_photos {
+            std::fs::write(folder.join(format!("{photo}.png")), encode_png(&image).unwrap()).unwrap();
+            let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+            frames.push(format!(r#"{{"file_path": "{photo}.png", "transform_matrix": {pose}}}"#));
+        }
+        let cameras = format!(r#"{{"fl_x": 20, "frames": [{}]}}"#, frames.join(","));
+        std::fs::write(folder.join("transforms.json"), cameras).unwrap();
+    }
+
+    #[test]
+    fn held_out_frames_do_not_make_a_capture_long_enough() {
+        let root = tempfile::tempdir().unwrap();
+        write_capture(&root.path().join("attic"), 32, 7);
+        let mut config = Config::default();
+        (config.data.source, config.data.root) = (SourceKind::Captures, Some(root.path().to_owned()));
+        (config.data.width, config.data.height) = (32, 24);
+        (config.data.views.min_gap, config.data.views.max_gap) = ([5, 6], [8, 24]);
+        for (hold_out, expected) in [(8, "0 of 1"), (0, "1 of 1")] {
+            config.data.hold_out = hold_out;
+            let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
+            let expected = format!("  long enough     {expected}: data.views.min_gap needs 7 training frames");
+            assert!(text.contains(&expected), "{text}");
+        }
+    }
+
     #[test]
     fn captures_are_listed_with_keys_and_every_size() {
         let root = tempfile::tempdir().unwrap();
         for (key, width) in [("attic", 32), ("barn", 48), ("cellar", 48)] {
-            let folder = root.path().join(key);
-            std::fs::create_dir(&folder).unwrap();
-            let image = RgbImage { width, height: 24, rgb: vec![9; width * 24 * 3] };
-            std::fs::write(folder.join("0.png"), encode_png(&image).unwrap()).unwrap();
-            let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
-            let frames = format!(r#"{{"fl_x": 20, "frames": [{{"file_path": "0.png", "transform_matrix": {pose}}}]}}"#);
-            std::fs::write(folder.join("transforms.json"), frames).unwrap();
+            write_capture(&root.path().join(key), width, 1);
         }
         let text = describe_folder(root.path()).unwrap().to_string();
         assert!(text.contains("\n  keys            attic, barn, cellar\n"), "{text}");

@@ -44,7 +44,7 @@ pub struct SplitReport {
     pub keys: Vec<String>,
     /// Sizes and extents of these scenes.
     pub info: Option<SourceInfo>,
-    /// Frames that `data.views` needs, and the number of described scenes that have them; for training scenes.
+    /// Training frames that `data.views` needs, and the number of described scenes that have them; for training scenes.
     pub views: Option<[usize; 2]>,
 }
 
@@ -174,7 +174,7 @@ impl SplitReport {
             let of = self.num_described;
             rows.push((
                 "  long enough",
-                format!("{num_long} of {of}: data.views.min_gap needs {}", plural(needed, "frame")),
+                format!("{num_long} of {of}: data.views.min_gap needs {}", plural(needed, "training frame")),
             ));
         }
     }
