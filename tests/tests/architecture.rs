@@ -61,7 +61,7 @@ fn every_crate_has_its_rules() {
 }
 
 /// Texts of files by their path in the repository.
-pub type Sources = BTreeMap<String, String>;
+type Sources = BTreeMap<String, String>;
 
 /// Files of a crate by their module paths.
 type Modules<'a> = BTreeMap<String, Module<'a>>;
@@ -134,7 +134,7 @@ fn production(text: &str) -> Vec<String> {
 }
 
 /// A line without comment and without what stands between quotes.
-pub fn without_strings(line: &str) -> String {
+fn without_strings(line: &str) -> String {
     let (mut code, mut is_text, mut chars) = (String::new(), false, line.chars().peekable());
     while let Some(c) = chars.next() {
         match c {

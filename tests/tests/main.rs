@@ -2,7 +2,7 @@
 //!
 //! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
 //! checks data sets; `input` is wrong or damaged input; `bench` times the cases; `viewer` opens scenes in a
-//! browser. `architecture`, `links` and `old_names` read the sources instead, `licences` reads the dependencies, and
+//! browser. `architecture` and `links` read the sources instead, `licences` reads the dependencies, and
 //! `documents` runs every command of the documents.
 
 mod architecture;
@@ -13,7 +13,6 @@ mod evaluation;
 mod input;
 mod licences;
 mod links;
-mod old_names;
 mod support;
 mod training;
 mod viewer;

@@ -11,7 +11,7 @@ use crate::skip_report::SkipReport;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
-use crate::sources::open::{OpenedSource, SAME_SCENES, open_source};
+use crate::sources::open::{OpenedSource, open_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
 use crate::synthetic::config::SyntheticConfig;
@@ -27,13 +27,7 @@ pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, D
         SourceKind::Synthetic => {
             let source = SyntheticSource::new(SyntheticConfig { split, ..config.synthetic.clone() })?;
             let report = SkipReport::new(source.num_scenes());
-            OpenedSource {
-                source: Arc::new(source),
-                kind: config.source,
-                has_splits: true,
-                shares_scenes: false,
-                report,
-            }
+            OpenedSource { source: Arc::new(source), kind: config.source, shares_scenes: false, report }
         }
         kind => open_files(config, kind, split)?,
     };
@@ -59,17 +53,17 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
     let mut opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
     let source = &opened.source;
     let has_dl3dv = || (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene)));
-    let is_divided = opened.has_splits || config.files.test_scenes.is_some();
+    let is_divided = !opened.shares_scenes || config.files.test_scenes.is_some();
     if split == Split::Train && !is_divided && (opened.kind == SourceKind::Dl3dv || has_dl3dv()) {
         let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write \
                    the path of an evaluation index or of a file with one key per line (an empty file excludes none)";
         return Err(missing("data.files.test_scenes", fix));
     }
-    if opened.shares_scenes && config.hold_out > 0 {
-        opened.report.notes.retain(|note| note != SAME_SCENES);
-        let every = config.hold_out;
-        let note = format!("no test split: 1 of {every} frames (0, {every}, ..) is held out of training as a target");
-        opened.report.notes.push(note);
+    if opened.shares_scenes {
+        opened.report.notes.push(match config.hold_out {
+            0 => "no folders train/ and test/ and no list of test scenes: both splits are the same scenes".into(),
+            every => format!("no test split: 1 of {every} frames (0, {every}, ..) is held out of training as a target"),
+        });
     }
     Ok(opened)
 }

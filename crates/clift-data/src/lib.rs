@@ -49,7 +49,7 @@ pub use sources::dataset_root::DatasetRoot;
 pub use sources::filters::SceneFilters;
 pub use sources::keys::is_dl3dv_key;
 pub use sources::kind::SourceKind;
-pub use sources::open::{OpenedSource, SAME_SCENES, open_source};
+pub use sources::open::{OpenedSource, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
 pub use sources::photos::image_cache::ImageCacheConfig;
 pub use sources::subset::{SceneSubset, is_held_out};
@@ -64,7 +64,7 @@ pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views
 pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
-pub use sampling::training_clips::{ClipBatch, TrainingClips};
+pub use sampling::training_clips::TrainingClips;
 pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Cameras and poses.

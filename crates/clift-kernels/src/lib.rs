@@ -1,6 +1,6 @@
 //! CPU kernels of clift on f32 slices, forward and backward, without Burn.
 //!
-//! Every kernel is written once and compiled for every [`InstructionSet`]; the set is chosen at run time. Tasks are
+//! Every kernel is written once and compiled for every [`InstructionSet`]; the set is chosen at run time. Sums are
 //! divided by shape alone, so that results do not depend on the number of threads. Tensors of other types than f32 take
 //! the composed operations of `clift-model`.
 //!

@@ -5,7 +5,9 @@ use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, derive_seed};
-use clift_eval::{CodecOptions, EvalConfig, EvalError, EvalFrames, FittedCodec, evaluation_items, fit_codec};
+use clift_eval::{
+    CodecOptions, EvalConfig, EvalError, EvalFrames, EvalSplit, FittedCodec, evaluation_items, fit_codec,
+};
 use clift_model::{Grouping, ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
@@ -41,7 +43,10 @@ pub fn fit_token_codec(
         seed: derive_seed(config.seed, "codec"),
     };
     let mut progress = EvalEvents { stop, sink, ranks: &Ranks::single(), is_stage: false };
-    let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
+    let fitted = fit_codec(model, reader, &items, &options, &mut progress).map_err(|error| match error {
+        EvalError::Interrupted { .. } => TrainError::Abandoned { task: "fitting the token codec".into() },
+        error => error.into(),
+    })?;
     fitted.codec.write(&TokenCodec::path_of(weights))?;
     Ok(fitted)
 }
@@ -51,7 +56,7 @@ pub(crate) fn ensure_codec(
     config: &Config,
     weights: &Path,
     device: &Device,
-    data: (&ClipReader, EvalFrames),
+    training: &ClipReader,
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<(), TrainError> {
@@ -63,6 +68,8 @@ pub(crate) fn ensure_codec(
     if matches!(TokenCodec::beside(weights, &model), Ok(Some(_))) {
         return Ok(());
     }
+    // Held-out frames are not in the reader.
+    let data = (training, EvalFrames::whole(EvalSplit::Train));
     match fit_token_codec(config, (&model, weights), data, stop, sink) {
         Ok(FittedCodec { num_scenes, .. }) => {
             sink.event(&Event::Message(format!("token codec: fitted on {num_scenes} training scenes")));

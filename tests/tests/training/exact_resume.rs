@@ -25,7 +25,7 @@ fn killed_runs_end_the_same_with_any_loader_threads() {
         kill_at("step/stage1/25");
         assert_eq!(place.checkpoints(name, "stage1"), [17]);
         kill_at("set/4");
-        place.train(&format!("{name} --only clusters"), &set).ok().notes("clusters: resumed after 4 of 6 scenes");
+        place.train(&format!("{name} --only clusters"), &set).ok().notes("clusters: resumed after 4 of 6 context sets");
         kill_at("saved/stage2/17");
         place.train(name, &set).ok().notes("stage2: resumed after 17 of 30 steps");
         assert_eq!(place.checkpoints(name, "stage1"), [17, 30]);

@@ -55,8 +55,7 @@ pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
 }
 
 pub(crate) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageBatch, TrainError> {
-    let StageSettings { batch_size, accumulate, .. } = context.config.stage(stage);
-    stage_batch(context, stage, batch_size.div_ceil(accumulate))
+    stage_batch(context, stage, context.config.stage(stage).micro_batch_size())
 }
 
 /// Makes a batch with all tokens (stage 1) or with stored tokens (stage 2).

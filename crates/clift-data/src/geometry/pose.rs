@@ -23,6 +23,13 @@ impl Pose {
     /// The identity.
     pub const IDENTITY: Self = Self { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
+    /// Returns the rotation angle between two poses in radians, from its sine and cosine, which is exact for small angles too.
+    pub fn angle_to(self, other: Self) -> f64 {
+        let r = self.rotation.transpose() * other.rotation;
+        let axis = DVec3::new(r.y_axis.z - r.z_axis.y, r.z_axis.x - r.x_axis.z, r.x_axis.y - r.y_axis.x);
+        axis.length().atan2(r.diagonal().element_sum() - 1.0)
+    }
+
     /// Converts the upper three rows of a 4 x 4 matrix.
     ///
     /// # Errors

@@ -31,12 +31,8 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let format = known_format(bytes).map_err(bad)?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_SIDE);
-    limits.max_image_height = Some(MAX_SIDE);
-    limits.max_alloc = Some(MAX_DECODE_BYTES);
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
-    reader.limits(limits);
+    reader.limits(limits());
     let image = reader.decode().map_err(|error| bad(error.to_string()))?.into_rgb8();
     let (width, height) = image.dimensions();
     if width == 0 || height == 0 {
@@ -45,11 +41,20 @@ pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, D
     Ok(RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() })
 }
 
+fn limits() -> Limits {
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_SIDE);
+    limits.max_image_height = Some(MAX_SIDE);
+    limits.max_alloc = Some(MAX_DECODE_BYTES);
+    limits
+}
+
 /// Checks format, header and end of a JPEG or PNG file without decoding the image, which takes a hundred times as long.
 pub(crate) fn check_encoded(bytes: &[u8]) -> Result<(), String> {
     let format = known_format(bytes)?;
-    let size = ImageReader::with_format(Cursor::new(bytes), format).into_dimensions();
-    let (width, height) = size.map_err(|error| error.to_string().trim_end().to_owned())?;
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+    reader.limits(limits());
+    let (width, height) = reader.into_dimensions().map_err(|error| error.to_string().trim_end().to_owned())?;
     if width == 0 || height == 0 { Err(format!("the image is {width}x{height}")) } else { Ok(()) }
 }
 
@@ -82,10 +87,11 @@ pub(crate) fn read_header(path: &Path) -> Result<([usize; 2], Orientation), Data
         return Err(bad("expected an image file, found a folder or device".into()));
     }
     let reader = ImageReader::open(path).map_err(DataError::io("opening an image", path))?;
-    let reader = reader.with_guessed_format().map_err(DataError::io("reading an image", path))?;
+    let mut reader = reader.with_guessed_format().map_err(DataError::io("reading an image", path))?;
     if !matches!(reader.format(), Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("the image is neither JPEG nor PNG".into()));
     }
+    reader.limits(limits());
     let mut decoder = reader
         .into_decoder()
         .map_err(|error| bad(format!("the image cannot be read: {}", error.to_string().trim_end())))?;

@@ -37,6 +37,7 @@ impl SceneOrder {
         self.permuted((position / num_scenes) as u64, (position % num_scenes) as u64) as usize
     }
 
+    #[cfg(test)]
     pub fn batch_size(&self) -> usize {
         self.batch_size as usize
     }

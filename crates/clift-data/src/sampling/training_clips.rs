@@ -21,20 +21,9 @@ const MAX_STEPS_AHEAD: u32 = 4096;
 /// Reads the given frames of a scene as a clip.
 pub type ReadClip = dyn Fn(usize, &ViewIndices) -> Result<Clip, DataError> + Send + Sync;
 
-/// The clips of one training step, all with the same numbers of context and target views.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ClipBatch {
-    /// Step of the batch.
-    pub step: u64,
-    /// One clip per slot.
-    pub clips: Vec<Clip>,
-    /// Scenes that were skipped and replaced, with the reason.
-    pub skipped: Vec<SkippedScene>,
-}
-
 /// Reads the batch of any step as a pure function of (seed, step): scenes, views, and replacements of unusable scenes.
 ///
-/// A [`Prefetcher`](crate::sampling::prefetcher::Prefetcher) around [`TrainingClips::batch`] reads batches ahead.
+/// A [`Prefetcher`](crate::sampling::prefetcher::Prefetcher) around it reads batches ahead.
 pub struct TrainingClips {
     source: Arc<dyn SceneSource>,
     read: Arc<ReadClip>,
@@ -70,26 +59,13 @@ impl TrainingClips {
         Self { flip, ..self }
     }
 
-    /// Reads the batch of `step`.
+    /// Reads one slot of the batch of `step`. All clips of a batch have the same numbers of context and target views.
     ///
-    /// A scene that is too short or unreadable is listed in [`ClipBatch::skipped`] and replaced by the scene of the same
-    /// slot one step later, then two, and so on. Replacements have random streams of their own, so other slots do not
-    /// change.
+    /// A scene that is too short or unreadable is appended to `skipped` and replaced by the scene of the same slot one step
+    /// later, then two, and so on. Replacements have random streams of their own, so other slots do not change.
     ///
     /// # Errors
     /// [`DataError::NoUsableScene`] after 16 attempts and 64 different scenes (all scenes of a smaller source).
-    pub fn batch(&self, step: u64) -> Result<ClipBatch, DataError> {
-        let mut batch = ClipBatch { step, clips: Vec::new(), skipped: Vec::new() };
-        for slot in 0..self.order.batch_size() {
-            batch.clips.push(self.slot(step, slot, &mut batch.skipped)?);
-        }
-        Ok(batch)
-    }
-
-    /// Reads one slot of the batch of `step`, and appends the scenes that were skipped for it.
-    ///
-    /// # Errors
-    /// As [`TrainingClips::batch`].
     pub fn slot(&self, step: u64, slot: usize, skipped: &mut Vec<SkippedScene>) -> Result<Clip, DataError> {
         let num_context = self.sampler.num_context(self.seed, step);
         let filler = SlotFiller {
@@ -149,6 +125,13 @@ mod tests {
         TrainingClips::new(source, Arc::new(read), ViewSampler::default(), batch_size, seed).unwrap()
     }
 
+    fn batch(clips: &TrainingClips, step: u64) -> Result<(Vec<Clip>, Vec<SkippedScene>), DataError> {
+        let mut skipped = Vec::new();
+        let slots = 0..clips.order.batch_size();
+        let read = slots.map(|slot| clips.slot(step, slot, &mut skipped)).collect::<Result<_, _>>()?;
+        Ok((read, skipped))
+    }
+
     fn mixed() -> TrainingClips {
         clips((0..40).map(|scene| if scene % 3 == 0 { 10 } else { 200 }).collect(), 4, 9)
     }
@@ -158,16 +141,16 @@ mod tests {
     fn first_thousand_batches_are_reproducible() {
         let rare = (0..300).map(|scene| if scene % 23 == 5 { 90 } else { 10 + scene % 17 }).collect();
         for (clips, expected) in [(mixed().with_flip(true), 0xd652_d9cf), (clips(rare, 8, 12345), 0x1fc9_670d)] {
-            let line = |batch: ClipBatch| {
-                let clips = batch.clips.iter().map(|Clip { key, context, target }| {
+            let line = |step: u64, (clips, skipped): (Vec<Clip>, Vec<SkippedScene>)| {
+                let clips = clips.iter().map(|Clip { key, context, target }| {
                     (key, &context.frame_index, &target.frame_index, context.c2w[0].translation[0])
                 });
-                let skips = batch.skipped.iter().map(|skip| (&skip.key, &skip.reason));
-                format!("{} {:?} {:?}", batch.step, clips.collect::<Vec<_>>(), skips.collect::<Vec<_>>())
+                let skips = skipped.iter().map(|skip| (&skip.key, &skip.reason));
+                format!("{step} {:?} {:?}", clips.collect::<Vec<_>>(), skips.collect::<Vec<_>>())
             };
             let mut checksum = crc32fast::Hasher::new();
             for step in 0..1000 {
-                let line = clips.batch(step).map_or_else(|error| error.to_string(), line);
+                let line = batch(&clips, step).map_or_else(|error| error.to_string(), |batch| line(step, batch));
                 checksum.update(format!("{line}\n").as_bytes());
             }
             assert_eq!(checksum.finalize(), expected);
@@ -177,15 +160,15 @@ mod tests {
     #[test]
     fn replacements_do_not_change_other_slots() {
         let good = clips(vec![200; 40], 4, 9);
-        let (whole, patched) = (good.batch(3).unwrap(), mixed().batch(3).unwrap());
+        let ((whole, _), (patched, skipped)) = (batch(&good, 3).unwrap(), batch(&mixed(), 3).unwrap());
         let mut same = 0;
-        for (whole, patched) in whole.clips.iter().zip(&patched.clips) {
+        for (whole, patched) in whole.iter().zip(&patched) {
             if whole.key == patched.key {
                 assert_eq!(whole, patched);
                 same += 1;
             }
         }
-        assert!(same >= 1 && !patched.skipped.is_empty(), "{same} slots agree, {:?}", patched.skipped);
+        assert!(same >= 1 && !skipped.is_empty(), "{same} slots agree, {skipped:?}");
     }
 
     #[test]
@@ -195,21 +178,21 @@ mod tests {
             let lengths = (0..num_scenes).map(|scene| if scene == 1 { 200 } else { 10 }).collect();
             let clips = clips(lengths, batch_size, 9);
             for step in 0..50 {
-                let batch = clips.batch(step).unwrap();
-                assert!(batch.clips.iter().all(|clip| clip.key == "scene-1"), "{num_scenes} scenes, step {step}");
+                let (clips, _) = batch(&clips, step).unwrap();
+                assert!(clips.iter().all(|clip| clip.key == "scene-1"), "{num_scenes} scenes, step {step}");
             }
         }
     }
 
     #[test]
     fn slot_fails_after_64_scenes_or_16_attempts() {
-        let attempts = |num_scenes| match clips(vec![10; num_scenes], 1, 9).batch(0) {
+        let attempts = |num_scenes| match batch(&clips(vec![10; num_scenes], 1, 9), 0) {
             Err(DataError::NoUsableScene { attempts, .. }) => attempts,
             other => panic!("{other:?}"),
         };
         assert_eq!([attempts(1), attempts(1000)], [16, 64]);
         assert!((40..=56).contains(&attempts(40)), "{} attempts for 40 scenes", attempts(40));
-        let error = clips(vec![10; 40], 4, 9).batch(2).unwrap_err().to_string();
+        let error = batch(&clips(vec![10; 40], 4, 9), 2).unwrap_err().to_string();
         assert!(error.starts_with("no usable scene for slot 0 of step 2 in "), "{error}");
         assert!(error.ends_with(": not enough frames: 26 needed, 10 in the scene"), "{error}");
     }

@@ -160,9 +160,6 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
-        check_config(!self.inner.needs_centres() || centres.len() == num_frames, "centres", || {
-            format!("has {} values; farthest_point needs {num_frames}, one per frame", centres.len())
-        })?;
         let Self { min_context, max_context, .. } = *self;
         check_config((min_context..=max_context).contains(&num_context), "num_context", || {
             format!("is {num_context}; use {min_context} to {max_context}")

@@ -27,18 +27,13 @@ const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
 /// Smallest number of chunks with a cached census; fewer are read in a second.
 const MIN_CENSUS_CHUNKS: usize = 100;
 
-/// Note on a data set whose splits are not separated; irrelevant if only one split is opened.
-pub const SAME_SCENES: &str = "no folders train/ and test/ and no list of test scenes: both splits are the same scenes";
-
 /// An open data set.
 pub struct OpenedSource {
     /// Scenes of the data set.
     pub source: Arc<dyn SceneSource>,
     /// Detected layout, or [`SourceKind::Synthetic`].
     pub kind: SourceKind,
-    /// Whether training and test scenes are separate without a list: in folders `train/` and `test/`, or synthetic.
-    pub has_splits: bool,
-    /// Whether both splits are the same scenes.
+    /// Whether both splits are the same scenes: without folders `train/` and `test/` and without a list of test scenes.
     pub shares_scenes: bool,
     /// Skipped scenes and frames.
     pub report: SkipReport,
@@ -47,9 +42,10 @@ pub struct OpenedSource {
 impl OpenedSource {
     /// The frames that training may read: all, or without one in `hold_out` where both splits are the same scenes.
     pub fn training_source(&self, hold_out: usize) -> Arc<dyn SceneSource> {
-        match self.shares_scenes && hold_out > 0 {
-            true => Arc::new(SceneSubset::without_held_out(self.source.clone(), hold_out)),
-            false => self.source.clone(),
+        if self.shares_scenes && hold_out > 0 {
+            Arc::new(SceneSubset::without_held_out(self.source.clone(), hold_out))
+        } else {
+            self.source.clone()
         }
     }
 }
@@ -57,7 +53,7 @@ impl OpenedSource {
 /// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` if it has neither. `root` may be a data
 /// set, a single scene, or a `transforms.json` of any name.
 ///
-/// Without split folders both splits are the same scenes (with a note in the report), unless
+/// Without split folders both splits are the same scenes, unless
 /// [`FileOptions::test_scenes`](crate::sources::options::FileOptions::test_scenes) separates them.
 ///
 /// # Errors
@@ -72,18 +68,13 @@ pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) ->
     let list = list.filter(|list| list.num_scenes() > 0);
     let folder = SplitFolder::find(root, split)?;
     let list = list.as_ref();
-    let (kind, (source, mut report)) = match folder.detect(options.kind)? {
+    let (kind, (source, report)) = match folder.detect(options.kind)? {
         DetectedSource::Torch(kind) => (kind, folder.open_torch(kind, options, list)?),
         DetectedSource::Photos(kind, scenes, report) => {
             (kind, folder.open_photos(kind, scenes, report, options, list)?)
         }
     };
-    let has_splits = root.has_splits;
-    let shares_scenes = !has_splits && list.is_none();
-    if shares_scenes {
-        report.notes.push(SAME_SCENES.into());
-    }
-    Ok(OpenedSource { source, kind, has_splits, shares_scenes, report })
+    Ok(OpenedSource { source, kind, shares_scenes: !root.has_splits && list.is_none(), report })
 }
 
 /// A source with what it skipped.

@@ -8,6 +8,7 @@ use glam::{DVec3, Vec3};
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::synthetic::room::{Object, Room, Shape, turned};
+use crate::synthetic::tracing::noise::smooth;
 
 /// Smallest absolute slope of a slab test; keeps the test finite for rays along an axis.
 const LEAST_SLOPE: f32 = 1e-6;
@@ -249,12 +250,6 @@ fn lamp_glow(room: &Room, hit: &Hit) -> Vec3 {
     let across = hit.point - room.lamp;
     let squared = across.x.powi(2) + across.z.powi(2);
     Vec3::new(1.0, 0.95, 0.85) * (2.0 * smooth(1.5 - 12.0 * squared))
-}
-
-/// Returns the Hermite step from 0 to 1.
-fn smooth(x: f32) -> f32 {
-    let x = x.clamp(0.0, 1.0);
-    x * x * (3.0 - 2.0 * x)
 }
 
 #[cfg(test)]

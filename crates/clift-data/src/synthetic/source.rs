@@ -50,11 +50,6 @@ impl SyntheticSource {
         Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect(), kept: Mutex::default() })
     }
 
-    /// Returns the options of the scenes.
-    pub fn config(&self) -> &SyntheticConfig {
-        &self.config
-    }
-
     fn key_prefix(&self) -> String {
         let SyntheticConfig { look, seed, split, .. } = self.config;
         let kind = if look == Look::Real { "real-" } else { "" };
@@ -301,7 +296,7 @@ mod tests {
             }
             let step = |pair: &[Camera]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
             let length: f64 = cameras.windows(2).map(step).sum();
-            let wanted = source.config().path_length;
+            let wanted = source.config.path_length;
             assert!((0.9 * wanted..1.3 * wanted).contains(&length), "scene {scene}: {length}");
         }
     }

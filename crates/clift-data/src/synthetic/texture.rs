@@ -6,6 +6,7 @@ use glam::Vec3;
 use rand::Rng;
 
 use crate::random::{uniform_01, uniform_below};
+use crate::synthetic::tracing::noise::smooth;
 
 /// Pattern in which the two colours alternate.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -66,8 +67,7 @@ impl Texture {
 
 /// Maps a wave in `[-1, 1]` to plateaus at 0 and 1 with edges wider than a pixel.
 fn soft_edge(wave: f32) -> f32 {
-    let x = (0.5 + 1.2 * wave).clamp(0.0, 1.0);
-    x * x * (3.0 - 2.0 * x)
+    smooth(0.5 + 1.2 * wave)
 }
 
 /// Converts hue (in turns), saturation and value to a linear colour, for a display gamma of 2.

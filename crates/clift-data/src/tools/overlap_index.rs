@@ -82,6 +82,7 @@ impl OverlapOptions {
         if num_frames <= near {
             return Err(format!("shorter than {} frames", near + 1));
         }
+        let far = far.min(num_frames);
         let mut rng = step_rng(derive_seed(self.seed, key), 0, "evaluation index");
         for frame in sample_from(&mut rng, (0..num_frames).collect(), num_frames) {
             let overlaps = |partner: &usize| {

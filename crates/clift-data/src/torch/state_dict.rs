@@ -21,6 +21,8 @@ use crate::torch::values::{ElementType, Tensor, Value};
 const FLOATS: [ElementType; 4] = [ElementType::F32, ElementType::F16, ElementType::BF16, ElementType::F64];
 /// Name of the dict beside the state dict in which [`write_state_dict`] stores the sizes of a network.
 const SIZES: &str = "clift";
+/// Longest key of a tensor; each is copied.
+const MAX_KEY_BYTES: usize = 4096;
 
 /// An open checkpoint. Tensors are read on demand.
 pub struct StateDict {
@@ -59,6 +61,9 @@ impl StateDict {
         for (key, value) in items {
             // Keys of state dicts are strings.
             if let Value::Str(key) = pickle.get(*key) {
+                if key.len() > MAX_KEY_BYTES {
+                    return Err(bad(format!("a key of {} bytes, expected at most {MAX_KEY_BYTES}", key.len())));
+                }
                 let tensor = match pickle.get(*value) {
                     Value::Tensor(tensor) => Some((**tensor).clone()),
                     _ => None,

@@ -44,10 +44,10 @@ pub(crate) fn tensor_span(
 /// Returns the stretch of storage that a strided tensor lies in, as a tensor of one dimension.
 pub(crate) fn storage_stretch(tensor: &Tensor) -> Result<Tensor, String> {
     let Tensor { shape, stride, .. } = tensor;
-    let length = shape.iter().zip(stride).try_fold(1_u64, |length, (&size, &stride)| {
-        // An empty tensor is contiguous, or reads one element here.
-        length.checked_add(size.saturating_sub(1).checked_mul(stride)?)
-    });
+    let length = shape
+        .iter()
+        .zip(stride)
+        .try_fold(1_u64, |length, (&size, &stride)| length.checked_add(size.saturating_sub(1).checked_mul(stride)?));
     let count = shape.iter().try_fold(1_u64, |count, &size| count.checked_mul(size));
     // Overlapping elements are refused: a small file could claim any number of them.
     let is_held = length.zip(count).is_some_and(|(length, count)| count <= length);

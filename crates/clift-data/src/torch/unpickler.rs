@@ -11,6 +11,8 @@ const MAX_CHECKPOINT_DEPTH: usize = 256;
 const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers the storages.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
+/// Longest module or name of a Python object.
+const MAX_NAME_BYTES: usize = 1000;
 
 /// Reads a pickle; returns the outermost value and the machine that holds all values.
 pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<(ValueId, PickleMachine<'_>), UnpickleError> {
@@ -151,6 +153,10 @@ impl PickleMachine<'_> {
                 let (Value::Str(name), Value::Str(module)) = (self.get(name), self.get(module)) else {
                     return Err("a Python name that is not a string".into());
                 };
+                // Copied at every use: one long string could be used a million times.
+                if module.len().max(name.len()) > MAX_NAME_BYTES {
+                    return Err("a Python name of more than 1,000 bytes".into());
+                }
                 let (module, name) = (module.clone(), name.clone());
                 self.push_global(&module, &name)?;
             }

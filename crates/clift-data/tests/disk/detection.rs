@@ -71,7 +71,7 @@ fn captures_named_as_splits_hide_no_others() {
     copy("colmap_bin/attic", &root.path().join("train"));
     copy("colmap_bin/attic", &root.path().join("truck"));
     let opened = open_any(root.path(), Split::Train);
-    assert_eq!((keys(&opened), opened.has_splits), (vec!["train", "truck"], false));
+    assert_eq!((keys(&opened), opened.shares_scenes), (vec!["train", "truck"], true));
     fs::rename(root.path().join("truck"), root.path().join("test")).unwrap();
     assert!(has_splits(root.path()), "two splits of one capture each");
     copy("colmap_bin/attic", &root.path().join("truck"));

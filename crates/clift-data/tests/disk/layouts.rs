@@ -228,8 +228,8 @@ fn split_folders_differ_from_a_shared_folder() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layout("capture"), &root.path().join("train"));
     let opened = open_kind(root.path(), Split::Train, SourceKind::Auto);
-    assert!(opened.has_splits && opened.report.notes.is_empty());
+    assert!(!opened.shares_scenes && opened.report.notes.is_empty());
     let error = open_test(root.path()).err().unwrap();
     assert!(error.starts_with("no scenes found: no folder test/ beside the other split: "));
-    assert!(!open_test(&root.path().join("train")).unwrap().has_splits);
+    assert!(open_test(&root.path().join("train")).unwrap().shares_scenes);
 }

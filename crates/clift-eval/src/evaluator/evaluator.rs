@@ -126,6 +126,13 @@ impl Evaluator {
             self.require_images(external, &summary)?;
         }
         let Some(sheets) = sheets else { return Ok(summary) };
+        let complete = folder.join("summary.json");
+        // Last: an evaluation with a summary is complete. That of a former evaluation goes first.
+        if let Err(error) = std::fs::remove_file(&complete)
+            && error.kind() != std::io::ErrorKind::NotFound
+        {
+            return Err(EvalError::io("removing the former summary", &complete)(error));
+        }
         sheets.keep()?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
@@ -134,8 +141,7 @@ impl Evaluator {
         let report =
             Report { run: self.description.clone(), summary: summary.clone(), training, scenes, skipped, figures };
         report.write(&folder.join("report.html"))?;
-        // Last: an evaluation with a summary is complete.
-        summary.write(&folder.join("summary.json"))?;
+        summary.write(&complete)?;
         Ok(summary)
     }
 

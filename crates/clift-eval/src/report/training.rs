@@ -30,7 +30,7 @@ pub fn section(curves: &[TrainingCurve]) -> Markup {
             }
             p.note {
                 "Training: batches with few or many tokens per view, averaged over "
-                "neighbouring steps. Validation: " code { "eval.num_validation_scenes" } " scenes of the evaluated split."
+                "neighbouring steps. Validation: " code { "eval.num_validation_scenes" } " scenes."
             }
         }
     }

@@ -37,9 +37,12 @@ impl fmt::Display for Summary {
         writeln!(f)?;
         let names = points.iter().map(|point| point.key.method.name().chars().count());
         let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
+        let formats = points.iter().map(|point| point.key.format_name().len());
+        let mut widths = WIDTHS;
+        widths[2] = formats.fold(WIDTHS[2], usize::max);
         let mut row = |name: &str, cells: [String; 13], mark: &str| {
             write!(f, "{name:<width$}")?;
-            for (cell, width) in cells.iter().zip(WIDTHS) {
+            for (cell, width) in cells.iter().zip(widths) {
                 write!(f, " {cell:>width$}")?;
             }
             writeln!(f, "{mark}")

@@ -1,6 +1,6 @@
 //! Baselines: the nearest context view, and the mean of all context views.
 
-use clift_data::{ClipViews, DVec3, Pose};
+use clift_data::{ClipViews, Pose};
 
 use crate::error::EvalError;
 
@@ -14,7 +14,7 @@ pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, Eva
     let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
     let tie = TIE * distances.iter().copied().fold(0.0, f64::max);
     let near: Vec<usize> = (0..distances.len()).filter(|&i| distances[i] <= nearest + tie).collect();
-    let angles: Vec<f64> = near.iter().map(|&i| rotation_angle_rad(context_c2w[i], target_c2w)).collect();
+    let angles: Vec<f64> = near.iter().map(|&i| context_c2w[i].angle_to(target_c2w)).collect();
     let smallest = angles.iter().copied().fold(f64::INFINITY, f64::min);
     let first = angles.iter().position(|&angle| angle <= smallest + TIE).ok_or(EvalError::NoContext)?;
     Ok(near[first])
@@ -46,16 +46,9 @@ pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
     Ok(sums.into_iter().map(|sum| (f64::from(sum) / scale) as f32).collect())
 }
 
-/// Returns the rotation angle between two poses, from its sine and cosine, which is exact for small angles too.
-fn rotation_angle_rad(a: Pose, b: Pose) -> f64 {
-    let r = a.rotation.transpose() * b.rotation;
-    let axis = DVec3::new(r.y_axis.z - r.z_axis.y, r.z_axis.x - r.x_axis.z, r.x_axis.y - r.y_axis.x);
-    axis.length().atan2(r.diagonal().element_sum() - 1.0)
-}
-
 #[cfg(test)]
 mod tests {
-    use clift_data::DMat3;
+    use clift_data::{DMat3, DVec3};
 
     use super::*;
     use crate::testing::gray_views;
@@ -83,7 +76,7 @@ mod tests {
     #[test]
     fn rotation_angles_are_exact() {
         for angle_deg in [0.0, 1e-6, 30.0, 90.0, 150.0, 180.0] {
-            let angle = rotation_angle_rad(pose(0.0, 0.0), pose(0.0, angle_deg)).to_degrees();
+            let angle = pose(0.0, 0.0).angle_to(pose(0.0, angle_deg)).to_degrees();
             // Products of sines and cosines near 1 round at 1e-16; 1e-12 degrees is above that.
             assert!((angle - angle_deg).abs() < 1e-12, "{angle} is not {angle_deg}");
         }

@@ -88,9 +88,9 @@ fn add_jobs<'a>(
     // A stage 2 with its own token norm clusters and condenses the tokens of its own norm.
     let normed: Vec<(Method, Tokens)> = [Method::Clift, Method::PatchClift]
         .into_iter()
-        .filter_map(|method| Some((method, &models.for_method(method)?.network)))
-        .filter(|(_, network)| network.has_token_norm())
-        .map(|(method, network)| (method, network.normalize(features.clone())))
+        .filter_map(|method| Some((method, models.for_method(method)?)))
+        .filter(|(_, model)| model.config.has_token_norm())
+        .map(|(method, model)| (method, model.network.normalize(features.clone())))
         .collect();
     let lift = stage1.normalize(features); // [1, N, D]
     let [_, num_tokens, _] = lift.dims();
@@ -118,8 +118,8 @@ fn add_jobs<'a>(
                 let all = RenderJob::new(whole, &stored, None, kept_views);
                 renderer.warm_up(&all, metrics)?;
                 jobs.push(all);
-                let can_select = stored.model.network.supports_selection();
-                let counts = if can_select { render_counts(&sweep.render, num_storage_tokens) } else { Vec::new() };
+                let has_latents = stored.model.config.has_latents();
+                let counts = if has_latents { Vec::new() } else { render_counts(&sweep.render, num_storage_tokens) };
                 for num_render_tokens in counts {
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;

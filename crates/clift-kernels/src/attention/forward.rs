@@ -27,18 +27,20 @@ pub fn attention_forward(
     sizes: AttentionSizes,
     [query, key, value]: [StridedRows<'_>; 3],
     output: &mut [f32],
-    log_sum: Option<&mut [f32]>,
+    log_sum: &mut [f32],
 ) {
     assert_eq!(output.len(), sizes.batch * sizes.num_queries * sizes.dim(), "output has one row per query");
+    assert_eq!(log_sum.len(), sizes.batch * sizes.num_heads * sizes.num_queries, "one sum per query and head");
     if sizes.num_keys == 0 {
         output.fill(0.0);
+        log_sum.fill(f32::NEG_INFINITY);
         return;
     }
     let blocks = sizes.num_queries.div_ceil(QUERY_BLOCK);
     let parts = sizes.parts(blocks);
     let output = SharedSlice::new(output);
     let output = HeadBlocks { values: &output, count: sizes.num_queries, width: sizes.dim(), first: 0 };
-    let log_sum = log_sum.map(SharedSlice::new);
+    let log_sum = SharedSlice::new(log_sum);
     (0..sizes.batch * sizes.num_heads * parts).into_par_iter().for_each(|task| {
         let (head, part) = (task / parts, task % parts);
         let bound = |part: usize| (part * blocks / parts * QUERY_BLOCK).min(sizes.num_queries);
@@ -46,7 +48,7 @@ pub fn attention_forward(
             sizes,
             inputs: [query, key, value],
             output,
-            log_sum: log_sum.as_ref(),
+            log_sum: &log_sum,
             scene: head / sizes.num_heads,
             head: head % sizes.num_heads,
             queries: bound(part)..bound(part + 1),
@@ -59,7 +61,7 @@ struct Forward<'a> {
     sizes: AttentionSizes,
     inputs: [StridedRows<'a>; 3],
     output: HeadBlocks<'a>,
-    log_sum: Option<&'a SharedSlice<'a>>,
+    log_sum: &'a SharedSlice<'a>,
     scene: usize,
     head: usize,
     queries: Range<usize>,
@@ -118,13 +120,11 @@ impl<'a> ProductKernel for Forward<'a> {
                 // SAFETY: no other task has this query of this head.
                 unsafe { output.write([scene, start + row, head], result) };
             }
-            if let Some(log_sum) = log_sum {
-                let first = (scene * sizes.num_heads + head) * sizes.num_queries + start;
-                // SAFETY: no other task has this query of this head.
-                let to = unsafe { log_sum.part(first, rows) };
-                for (row, to) in to.iter_mut().enumerate() {
-                    *to = highest[row] + total[row].log2();
-                }
+            let first = (scene * sizes.num_heads + head) * sizes.num_queries + start;
+            // SAFETY: no other task has this query of this head.
+            let to = unsafe { log_sum.part(first, rows) };
+            for (row, to) in to.iter_mut().enumerate() {
+                *to = highest[row] + total[row].log2();
             }
         }
     }

@@ -18,6 +18,8 @@ use crate::weights::trained_model::TrainedModel;
 const BIT_VALUE: f32 = 0.1155;
 /// Largest magnitude of a level.
 const MAX_LEVEL: f32 = (1 << 30) as f32;
+/// Most values that coded tokens may have: as many as the largest plain file has in f32.
+const MAX_VALUES: f64 = (1 << 28) as f64;
 
 /// Transform, probabilities and measured rates of a model's tokens.
 #[derive(Clone, Debug, PartialEq)]
@@ -120,23 +122,12 @@ impl TokenCodec {
         Ok(encoder.finish())
     }
 
-    /// Decodes tokens and their ids, which may be damaged or hostile: memory is bounded by the number of words.
+    /// Decodes tokens and their ids, which may be damaged or hostile: memory is bounded by the number of words, and by
+    /// `MAX_VALUES`.
     ///
     /// # Errors
-    /// [`ModelError::BadConfig`] for words that no encoder writes.
+    /// The problem of words that no encoder writes.
     pub fn decode(
-        &self,
-        words: Vec<u32>,
-        num_tokens: usize,
-        num_patches: usize,
-        step: f32,
-    ) -> Result<(Vec<u32>, Vec<f32>), ModelError> {
-        let decoded = self.decode_words(words, num_tokens, num_patches, step);
-        decoded.map_err(|fix| ModelError::BadConfig { key: "tokens", value: "coded".into(), fix })
-    }
-
-    /// As [`decode`](Self::decode). Errors name the problem of the words.
-    pub(crate) fn decode_words(
         &self,
         words: Vec<u32>,
         num_tokens: usize,
@@ -148,7 +139,7 @@ impl TokenCodec {
         }
         check_step(step)?;
         let dim = self.transform.mean.len();
-        let most = (words.len() as f64 + 1.0) * 32.0 / MIN_BITS;
+        let most = ((words.len() as f64 + 1.0) * 32.0 / MIN_BITS).min(MAX_VALUES);
         if num_tokens as f64 * dim as f64 > most {
             return Err(format!(
                 "{num_tokens} tokens of width {dim} in {} words, expected at most {most:.0} values",

@@ -5,7 +5,7 @@ use crate::cost::scene_sizes::SceneSizes;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Sequence};
 use crate::ops::attention::composed::MAX_SCORES;
-use crate::tokens::kmeans::seeding::MAX_TABLE_LEN;
+use crate::tokens::kmeans::seeding::{MAX_TABLE_LEN, pool_len};
 
 /// Lists the tensors of one network that can be its largest, for a batch of equal scenes: description and number of
 /// values.
@@ -53,10 +53,7 @@ fn scores(num_queries: u64, heads: usize, keys: Sequence, sizes: &SceneSizes, sc
     scores_per_query * (MAX_SCORES as u64 / scores_per_query).clamp(1, (num_queries / groups.max(1)).max(1))
 }
 
-/// Returns the number of distances in the largest tensor of latent K-means: all pairs of tokens, or pairs of token and
-/// cluster if the former exceed `MAX_TABLE_LEN`.
+/// Returns the number of distances in the largest tensor of latent K-means, the table that its seeding reads.
 pub fn kmeans_values(num_tokens: usize, num_clusters: usize) -> u64 {
-    let table = num_tokens.saturating_mul(num_tokens);
-    let values = if table <= MAX_TABLE_LEN { table } else { num_tokens * num_clusters };
-    values as u64
+    pool_len(num_tokens, num_clusters, MAX_TABLE_LEN) as u64 * num_tokens as u64
 }

@@ -45,7 +45,7 @@ impl CliftVariant {
         self.into()
     }
 
-    /// Whether the network has the released code's condenser.
+    /// Whether the network is one of the released code's.
     pub fn is_released(self) -> bool {
         self != Self::Paper
     }

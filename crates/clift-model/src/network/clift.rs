@@ -58,11 +58,6 @@ impl Clift {
         self.encoder.forward(context)
     }
 
-    /// Whether [`normalize`](Self::normalize) changes the features.
-    pub fn has_token_norm(&self) -> bool {
-        self.lift_norm.is_norm()
-    }
-
     /// Returns the tokens that this model compresses and renders.
     ///
     /// # Shapes
@@ -95,11 +90,6 @@ impl Clift {
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         self.renderer.render(tokens, targets)
-    }
-
-    /// Whether a view can be rendered from a subset of the stored tokens.
-    pub fn supports_selection(&self) -> bool {
-        !self.renderer.is_joint()
     }
 }
 

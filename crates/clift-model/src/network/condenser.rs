@@ -13,7 +13,7 @@ use crate::network::init::Init;
 use crate::network::released_condenser::ReleasedCondenser;
 use crate::network::tokens::Tokens;
 use crate::ops::cluster_attention::operation::cluster_attention;
-use crate::ops::mac_counter;
+use crate::ops::linear::linear_in_f32;
 use crate::tokens::clusters::ClusterIndex;
 
 /// Condenser blocks. Their gates start at zero: an untrained condenser returns the centroids unchanged.
@@ -97,7 +97,7 @@ impl CondenserBlock {
             None => eq1,
         };
         let eq3 = self.residual(&eq2, self.feed_forward.forward(&self.norm_ff, eq2.clone()));
-        Tokens { values: centroids + self.gate(eq3), transforms } // equation 4
+        Tokens { values: centroids + linear_in_f32(&self.gate, eq3), transforms } // equation 4
     }
 
     /// Equation 2: each centroid attends to the members of its cluster. A cluster of one token has no keys and keeps the
@@ -124,13 +124,6 @@ impl CondenserBlock {
     /// print it.
     fn residual(&self, input: &Tensor<3>, output: Tensor<3>) -> Tensor<3> {
         if self.norm_cross.is_some() { input.clone() + output } else { output }
-    }
-
-    /// Applies `W_z` with Burn's linear layer: those of this crate need a bias, and `W_z` has none.
-    fn gate(&self, x: Tensor<3>) -> Tensor<3> {
-        let [batch, stored, dim] = x.dims();
-        mac_counter::add_linear(batch * stored, dim, dim);
-        self.gate.forward(x)
     }
 }
 

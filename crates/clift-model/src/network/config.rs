@@ -197,7 +197,7 @@ impl ModelConfig {
     }
 
     /// Whether the encoder's tokens have a norm.
-    pub(crate) fn has_token_norm(&self) -> bool {
+    pub fn has_token_norm(&self) -> bool {
         self.variant.has_norms()
     }
 

@@ -19,7 +19,7 @@ use crate::views::upload::{Cameras, Views};
 /// one variant applies a [`LiftNorm`](crate::LiftNorm) to it.
 #[derive(Module, Debug)]
 pub struct Encoder {
-    /// Learned tokens `[1, L, D]` of LVSM, which are encoded in place of the patches.
+    /// Learned tokens `[1, L, D]` of LVSM, which are encoded beside the patches.
     latents: Option<Latents>,
     patch_embed: Linear,
     blocks: Vec<EncoderBlock>,

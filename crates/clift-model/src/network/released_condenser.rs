@@ -11,7 +11,7 @@ use crate::network::blocks::feed_forward::{Activation, FeedForward};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::ops::cluster_attention::operation::cluster_attention;
-use crate::ops::linear::linear;
+use crate::ops::linear::linear_in_f32;
 use crate::tokens::clusters::ClusterIndex;
 
 /// One pre-norm decoder layer, in which each centroid attends to the tokens of its cluster, and a gate.
@@ -60,6 +60,6 @@ impl ReleasedCondenser {
         let x = x + self.cluster_attn.project_out(attended, None);
 
         let x = x.clone() + self.feed_forward.forward(&self.norm_ff, x);
-        centroids + linear(&self.gate, x)
+        centroids + linear_in_f32(&self.gate, x)
     }
 }

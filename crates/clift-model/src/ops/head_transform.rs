@@ -147,22 +147,13 @@ impl HeadTransformKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl HeadTransformKernels for burn::backend::Cube {}
 
-macro_rules! head_transform_ops {
-    ($backend:ty) => {
-        impl HeadTransformOps for $backend {
-            fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
-                Self::transform(x, transforms, heads, false)
-            }
-        }
-    };
+impl<B: HeadTransformKernels> HeadTransformOps for B {
+    fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
+        Self::transform(x, transforms, heads, false)
+    }
 }
-head_transform_ops!(Flex);
-#[cfg(feature = "ndarray")]
-head_transform_ops!(burn::backend::NdArray);
-#[cfg(feature = "wgpu")]
-head_transform_ops!(burn::backend::Cube);
 
-impl<B: HeadTransformOps + HeadTransformKernels, C: CheckpointStrategy> HeadTransformOps for Autodiff<B, C> {
+impl<B: HeadTransformKernels, C: CheckpointStrategy> HeadTransformOps for Autodiff<B, C> {
     fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
         let (x, node) = x.into_parts();
         let (transforms, _) = transforms.into_parts();

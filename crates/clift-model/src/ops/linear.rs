@@ -32,7 +32,7 @@ pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: false, precision: Precision::current() })
 }
 
-/// Computes [`linear`] in f32, independent of the precision of this thread: for layers whose inputs are rays.
+/// Computes [`linear`] in f32, independent of the precision of this thread: for layers whose inputs are rays, and for gates.
 pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: false, precision: Precision::F32 })
 }
@@ -193,39 +193,30 @@ fn forward<B: LinearKernels>([x, weight, bias]: [FloatTensor<B>; 3], prologue: P
     B::linear_output(prologue.precision, [x, weight, bias])
 }
 
-macro_rules! linear_ops {
-    ($backend:ty) => {
-        impl LinearOps for $backend {
-            fn linear_layer(
-                x: FloatTensor<Self>,
-                weight: FloatTensor<Self>,
-                bias: FloatTensor<Self>,
-                prologue: Prologue,
-            ) -> FloatTensor<Self> {
-                forward::<Self>([x, weight, bias], prologue)
-            }
+impl<B: LinearKernels> LinearOps for B {
+    fn linear_layer(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        prologue: Prologue,
+    ) -> FloatTensor<Self> {
+        forward::<Self>([x, weight, bias], prologue)
+    }
 
-            fn norm_then_linear(
-                x: FloatTensor<Self>,
-                gamma: FloatTensor<Self>,
-                beta: FloatTensor<Self>,
-                weight: FloatTensor<Self>,
-                bias: FloatTensor<Self>,
-                precision: Precision,
-            ) -> FloatTensor<Self> {
-                let (normal, _statistics) = Self::norm_output([x, gamma, beta]);
-                Self::linear_output(precision, [normal, weight, bias])
-            }
-        }
-    };
+    fn norm_then_linear(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        precision: Precision,
+    ) -> FloatTensor<Self> {
+        let (normal, _statistics) = Self::norm_output([x, gamma, beta]);
+        Self::linear_output(precision, [normal, weight, bias])
+    }
 }
-linear_ops!(Flex);
-#[cfg(feature = "ndarray")]
-linear_ops!(burn::backend::NdArray);
-#[cfg(feature = "wgpu")]
-linear_ops!(burn::backend::Cube);
 
-impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff<B, C> {
+impl<B: LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff<B, C> {
     fn linear_layer(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,

@@ -22,12 +22,12 @@ use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
 use crate::files::replace;
 use crate::network::config::ModelConfig;
-use crate::scene::header::{Fields, Refusal, refusal, write_fields};
+use crate::scene::header::{COPY_AGAIN, Fields, GIVE_MODEL, Refusal, refusal, write_fields};
 use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, SceneNormalization};
+use crate::scene::token_coding::{CodedLoss, TokenCoding};
 use crate::scene::write::{WRITABLE_FOLDER, check_output_path};
 use crate::views::camera::ViewCamera;
 
-const COPY_AGAIN: &str = "copy it again, or encode the scene again";
 const WORLD_VALUES: usize = 13;
 const VIEW_BYTES: usize = 17 * 4;
 /// Bytes of step, normalization and checksum.
@@ -98,22 +98,23 @@ impl Scene {
     }
 }
 
-/// Reads a coded scene of a file whose safetensors header is valid. Returns the scene and its step.
+/// Reads a coded scene of a file whose safetensors header is valid. `find_codec` returns the codec of a model path.
 pub(crate) fn from_coded_bytes(
     bytes: &[u8],
     body: &[u8],
     fields: &Fields,
-    codec: &TokenCodec,
-) -> Result<(Scene, f32), Refusal> {
+    find_codec: &dyn Fn(&str) -> Result<TokenCodec, String>,
+) -> Result<(Scene, TokenCoding), Refusal> {
     let (checked, checksum) = bytes.split_last_chunk::<4>().ok_or_else(|| refusal("no checksum", COPY_AGAIN))?;
     let (found, stored) = (crc32fast::hash(checked), u32::from_le_bytes(*checksum));
     if found != stored {
         return Err(refusal(format!("the file is damaged: checksum {found:08x}, expected {stored:08x}"), COPY_AGAIN));
     }
+    let codec = find_codec(fields.get("model_path")?).map_err(|reason| refusal(reason, GIVE_MODEL))?;
     let hash = fields.get("codec")?;
     if hash != codec.hash {
-        let fix = "give the run it was encoded with (--model RUN)";
-        return Err(refusal(format!("the scene was coded with the codec {hash}, the model has {}", codec.hash), fix));
+        let reason = format!("the scene was coded with the codec {hash}, the model has {}", codec.hash);
+        return Err(refusal(reason, GIVE_MODEL));
     }
     let [views, num_tokens] = [fields.count("views")?, fields.count("tokens")?];
     let fixed = views.checked_mul(VIEW_BYTES).and_then(|bytes| bytes.checked_add(FIXED_BYTES));
@@ -132,8 +133,8 @@ pub(crate) fn from_coded_bytes(
         model: codec.model.clone(),
         renderer_hash: codec.renderer_hash.clone(),
         model_path: fields.get("model_path")?.into(),
-        height: fields.side("height")?,
-        width: fields.side("width")?,
+        height: fields.count("height")?,
+        width: fields.count("width")?,
         context: Vec::with_capacity(views),
         context_frames: Vec::with_capacity(views),
         world: SceneNormalization { mean_c2w: pose(world[..12].iter().copied()), scale: world[12] },
@@ -148,9 +149,10 @@ pub(crate) fn from_coded_bytes(
         scene.context_frames.push(u32::from_le_bytes(view.as_chunks::<4>().0[16]));
     }
     let num_patches = scene.check_views()?;
-    (scene.token_ids, scene.tokens) = codec.decode_words(words, num_tokens, num_patches, step)?;
+    (scene.token_ids, scene.tokens) = codec.decode(words, num_tokens, num_patches, step)?;
     scene.check()?;
-    Ok((scene, step))
+    let loss = codec.rates.loss(num_tokens as f64 / num_patches as f64, f64::from(step));
+    Ok((scene, TokenCoding::Coded(CodedLoss::from_db(loss))))
 }
 
 /// Returns the pose of three rows.

@@ -19,17 +19,15 @@ pub(crate) fn refusal(reason: impl Into<String>, fix: &'static str) -> Refusal {
     Refusal { reason: reason.into(), fix }
 }
 
+pub(crate) const COPY_AGAIN: &str = "copy it again, or encode the scene again";
+pub(crate) const GIVE_MODEL: &str = "give the run it was encoded with (--model RUN)";
+
 /// Metadata of a header that was read.
 pub(crate) struct Fields(pub HashMap<String, String>);
 
 impl Fields {
     pub fn get(&self, name: &str) -> Result<&str, String> {
         self.0.get(name).map(String::as_str).ok_or_else(|| format!("no `{name}` in the header"))
-    }
-
-    pub fn side(&self, name: &str) -> Result<usize, String> {
-        let value = self.get(name)?;
-        value.parse().map_err(|_| format!("{name} {value:?}, expected a number of pixels"))
     }
 
     pub fn count(&self, name: &str) -> Result<usize, String> {

@@ -9,10 +9,10 @@ use crate::error::ModelError;
 use crate::names::parse;
 use crate::network::config::ModelConfig;
 use crate::scene::coded_file::from_coded_bytes;
-use crate::scene::header::{Fields, Refusal, refusal};
+use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
 use crate::scene::scene::{CODED_VERSION, FORMAT, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name};
-use crate::scene::token_coding::{CodedLoss, TokenCoding};
+use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
 use crate::views::camera::ViewCamera;
 use crate::weights::model_path::ModelPath;
@@ -26,8 +26,6 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 const RAY_TOLERANCE: f64 = 1e-4;
 
 const GIVE_ANOTHER: &str = "give a file that `clift encode` wrote";
-const COPY_AGAIN: &str = "copy it again, or encode the scene again";
-const GIVE_MODEL: &str = "give the run it was encoded with (--model RUN)";
 const OTHER_VERSION: &str = "use the version of clift that wrote it, or encode the scene again";
 
 impl Scene {
@@ -87,11 +85,7 @@ fn from_bytes(
     let version = fields.get("version")?;
     if version == CODED_VERSION {
         let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
-        let codec = find_codec(fields.get("model_path")?).map_err(|reason| refusal(reason, GIVE_MODEL))?;
-        let (scene, step) = from_coded_bytes(bytes, body, &fields, &codec)?;
-        let num_patches = scene.model.num_patches(scene.context.len(), scene.height, scene.width).unwrap_or(1);
-        let loss = codec.rates.loss(scene.num_tokens() as f64 / num_patches as f64, f64::from(step));
-        return Ok((scene, TokenCoding::Coded(CodedLoss::from_db(loss))));
+        return from_coded_bytes(bytes, body, &fields, find_codec);
     }
     if ![VERSION, FORMER_VERSION].contains(&version) {
         let reason = format!("scene file version {version:?}, expected \"1\", {VERSION:?} or {CODED_VERSION:?}");
@@ -115,8 +109,8 @@ fn from_bytes(
         kind,
         renderer_hash: fields.get("renderer")?.into(),
         model_path: fields.get("model_path")?.into(),
-        height: fields.side("height")?,
-        width: fields.side("width")?,
+        height: fields.count("height")?,
+        width: fields.count("width")?,
         context: cameras.map(|(&c2w, &intrinsics)| ViewCamera { c2w, intrinsics }).collect(),
         context_frames: tensors.u32s("context_frames", &[views])?,
         world: SceneNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
@@ -166,6 +160,8 @@ fn check_rays(scene: &Scene, rays: &[f32]) -> Result<(), String> {
 
 impl Tensors<'_> {
     fn tokens(&self, model: &ModelConfig) -> Result<(TokenFormat, usize, Vec<f32>), String> {
+        // Its sizes bound what is allocated below.
+        model.validate().map_err(|error| error.to_string())?;
         let dim = model.dim;
         let dtype = self.view("tokens")?.dtype();
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));
@@ -175,13 +171,7 @@ impl Tensors<'_> {
         if self.0.len() != expected {
             return Err(format!("{} tensors, expected {expected}", self.0.len()));
         }
-        let count = if model.has_latents() {
-            // Their number is in the header alone, and bounds what is allocated.
-            model.validate().map_err(|error| error.to_string())?;
-            model.num_latents
-        } else {
-            self.length("token_ids")?
-        };
+        let count = if model.has_latents() { model.num_latents } else { self.length("token_ids")? };
         let scales = if format == TokenFormat::Int8 { self.f32s("token_scales", &[count])? } else { Vec::new() };
         if let Some(token) = scales.iter().position(|scale| !(scale.is_finite() && *scale >= 0.0)) {
             return Err(format!("scale {} of token {token}, expected a finite number", scales[token]));

@@ -6,6 +6,7 @@ use burn::module::Module;
 use burn::store::PathFilter;
 use burn::tensor::Device;
 
+use crate::cost::parameters::Parameters;
 use crate::error::ModelError;
 use crate::network::clift::{Clift, is_condenser};
 use crate::network::config::ModelConfig;
@@ -71,8 +72,9 @@ impl TrainedModel {
 pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let refuse = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     let size = std::fs::metadata(path).map_err(|error| refuse(error.to_string()))?.len();
-    // The sizes may come from a hostile scene file: no more memory is allocated than the weight file can fill.
-    let needed = min_renderer_bytes(config);
+    // The sizes may come from a hostile scene file: no more memory is allocated than the weight file, which may be in f16,
+    // can fill.
+    let needed = 2 * Parameters::of(config).renderer;
     if needed > size {
         return Err(refuse(format!("the scene's renderer needs at least {needed} bytes, the file has {size}")));
     }
@@ -85,21 +87,12 @@ pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Resu
     Ok(renderer)
 }
 
-/// Returns the bytes of the matrices in a renderer's blocks.
-fn min_renderer_bytes(config: &ModelConfig) -> u64 {
-    let [dim, hidden, blocks] = [config.dim, config.feed_forward_dim, config.num_renderer_blocks].map(|n| n as u64);
-    // Four matrices each for self- and, but in LVSM, cross-attention, two for the feed-forward network, in f32. The largest
-    // valid sizes do not overflow.
-    let in_attention = if config.has_latents() { 4 } else { 8 };
-    4 * blocks * (in_attention * dim * dim + 2 * dim * hidden)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::network::architecture::CliftVariant;
     use crate::testing::small_config;
-    use crate::weights::file::{save_part, save_weights};
+    use crate::weights::file::{save_part, save_part_f16, save_weights};
 
     #[test]
     fn both_stages_open_and_stage_1_has_no_condenser() {
@@ -126,5 +119,23 @@ mod tests {
         assert_eq!(weights_hash(&read.condenser), condenser);
         let loaded = load_part(&mut read, &Clift::stage1_part(), &stage1.weights).unwrap();
         loaded.require_all(&stage1.weights).unwrap();
+    }
+
+    #[test]
+    fn renderers_open_from_f16_and_files_too_small_for_them_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let device = Device::flex();
+        for variant in CliftVariant::ALL {
+            let config = small_config(variant);
+            let network = Clift::new(&config, 3, &device);
+            let path = folder.path().join(variant.as_str());
+            // The smallest file with a renderer.
+            let renderer = PathFilter::from_predicate(|name, _| name.starts_with("renderer."));
+            save_part_f16(&network, &renderer, &path).unwrap();
+            open_renderer(&config, &path, &device).unwrap();
+            let larger = ModelConfig { num_renderer_blocks: 64, ..config };
+            let message = open_renderer(&larger, &path, &device).unwrap_err().to_string();
+            assert!(message.contains("the scene's renderer needs at least "), "{message}");
+        }
     }
 }

@@ -99,7 +99,7 @@ impl Checkpoints {
     /// Loads the newest checkpoint into `train_state`. Returns `None` without a checkpoint.
     ///
     /// # Errors
-    /// [`TrainError::Damaged`] for a damaged checkpoint.
+    /// As [`load`](Self::load).
     pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
         let Some(step) = self.newest_step()? else { return Ok(None) };
         // Each save removes unfinished saves, but a finished stage makes no further save.
@@ -110,9 +110,18 @@ impl Checkpoints {
     /// Loads the checkpoint of a step into `train_state`, and changes no file.
     ///
     /// # Errors
-    /// [`TrainError::Damaged`] for a damaged checkpoint.
+    /// [`TrainError::Damaged`] for a damaged checkpoint, [`TrainError::BadConfig`] for one of another network,
+    /// [`TrainError::Io`] for files that cannot be read.
     pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<Progress, TrainError> {
         load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
+            let is_damage = match &source {
+                TrainError::BadFile { .. } => true,
+                TrainError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
+                _ => false,
+            };
+            if !is_damage {
+                return source;
+            }
             let older = self.steps().unwrap_or_default().into_iter().rfind(|older| *older < step);
             let fix = match older {
                 Some(older) => format!("remove {} to resume from {}", name_of(step), name_of(older)),
@@ -211,9 +220,10 @@ fn load_checkpoint(
         return Err(bad(STATE, format!("the checksum of {name} is missing")));
     }
     if let (Some(model), Some(expected)) = (&model, expected)
-        && model != expected
+        && *expected != (ModelConfig { patch_grids: expected.patch_grids, ..model.clone() })
     {
-        return Err(bad(STATE, format!("the network ({model:?}) differs from [model] of the config")));
+        let value = format!("{expected:?}");
+        return Err(crate::error::bad("model", value, &format!("{} is of the network {model:?}", folder.display())));
     }
     for (name, expected) in &files {
         let file = folder.join(name);

@@ -10,8 +10,10 @@ use crate::events::{Event, Sink};
 /// A folder that only one process may write to.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum LockedFolder {
-    /// A run directory.
+    /// The directory of a run that is trained.
     Run,
+    /// The directory of a run that is evaluated into it.
+    EvaluatedRun,
     /// The output folder of an evaluation.
     Evaluation,
 }
@@ -21,6 +23,7 @@ impl LockedFolder {
     const fn describe(self) -> (&'static str, &'static str) {
         match self {
             Self::Run => ("run directory", "another `run_dir`"),
+            Self::EvaluatedRun => ("run directory", "an --out outside of it"),
             Self::Evaluation => ("output folder", "another --out"),
         }
     }

@@ -146,11 +146,10 @@ impl Run {
         }
         self.report_opening(Split::Train, sink);
         let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
-        let frames = EvalFrames::new(&opened, Split::Train, self.config.data.hold_out, true);
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
         let train_stage2 = wanted(Stage::Stage2) && !has_stage2;
-        if train_stage2 {
+        if train_stage2 && !self.folder("stage2").join("checkpoints").exists() {
             // A wrong `stage2.init_from` is found before stage 1 takes its time.
             init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?;
         }
@@ -166,7 +165,7 @@ impl Run {
             }
         }
         if wanted(Stage::Stage2) && self.ranks.is_root() {
-            ensure_codec(&self.config, &self.weights(Stage::Stage2), &self.device, (&reader, frames), stop, sink)?;
+            ensure_codec(&self.config, &self.weights(Stage::Stage2), &self.device, &reader, stop, sink)?;
         }
         if only.is_some() {
             return Ok(None);
@@ -208,7 +207,7 @@ impl Run {
     ) -> Result<Summary, TrainError> {
         let run_dir = &self.config.run_dir;
         let is_inside = self.lock.is_none() && request.folder.is_in(run_dir);
-        let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::Run, sink)).transpose()?;
+        let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::EvaluatedRun, sink)).transpose()?;
         let mut models = self.models(sink)?;
         for other in beside {
             if other.model.has_latents() {
@@ -371,7 +370,7 @@ impl Run {
     fn reader(&self, opened: OpenedSource, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let OpenedSource { source, report, .. } = opened;
         sink.event(&Event::Message(format!("{split}: {report}")));
-        if self.ranks.is_root() && report.has_skips() && self.config.run_dir.is_dir() {
+        if self.lock.is_some() && report.has_skips() {
             write_skip_report(&report, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {

@@ -94,11 +94,11 @@ impl RenderLoop {
     ) -> Result<(Vec<u8>, SentFrame), ViewError> {
         let ClientView { scene, renderer, selection } = self.views.get_mut(&id).ok_or(ViewError::NoScene)?;
         let stored = scene.scene.num_tokens();
-        let size = request.size.min(scene.sizes.len() - 1);
+        let wanted = request.size.min(scene.sizes.len() - 1);
         let tokens = request.tokens.clamp(1, stored);
         let budget_s = request.budget_ms.filter(|_| !request.rest).map(|ms| ms.max(1.0) / 1e3);
-        let full = FrameSettings { tokens, quality: QUALITIES[0], size };
-        let FrameSettings { tokens, quality, size } = budget_s.map_or(full, |_| budget.settings(tokens, size));
+        let full = FrameSettings { tokens, quality: QUALITIES[0], size: wanted };
+        let FrameSettings { tokens, quality, size } = budget_s.map_or(full, |_| budget.settings(tokens, wanted));
         if *selection != request.selection {
             *selection = request.selection;
             renderer.set_rules(selection.rules());
@@ -129,7 +129,7 @@ impl RenderLoop {
             encode_ms: 1e3 * started.elapsed().as_secs_f64(),
         };
         let bits = if request.list_tokens { token_bits(view.tokens.as_deref(), stored) } else { Vec::new() };
-        let sent = SentFrame { seq: request.seq, budget: budget_s.map(|budget_s| (budget_s, request.size)) };
+        let sent = SentFrame { seq: request.seq, budget: budget_s.map(|budget_s| (budget_s, wanted)) };
         Ok((Reply::Frame(frame).to_bytes(&[&bits, &picture]), sent))
     }
 

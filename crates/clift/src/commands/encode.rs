@@ -15,7 +15,7 @@ use crate::commands::args::parse::{parse_kb, parse_loss, parse_split};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::json::write_json;
-use crate::output::stdout::{print_note, print_result};
+use crate::output::stdout::{print_result, print_warning};
 use crate::output::units::file_size;
 
 const MAX_LISTED_KEYS: usize = 8;
@@ -150,8 +150,8 @@ fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> 
         "check: frame {frame}, not a context: {psnr:.2} dB rendered, {nearest_psnr:.2} dB copied from the nearest context"
     ))?;
     if psnr < nearest_psnr {
-        print_note(&format!(
-            "warning: the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
+        print_warning(format!(
+            "the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
              from the training scenes of {}, or the run is not trained enough",
             model.display()
         ));

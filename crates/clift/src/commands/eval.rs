@@ -7,6 +7,7 @@ use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
 use clift_model::{ModelPath, TokenCoding, TokenCount};
 use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
 
+use crate::commands::args::model_args::check_network;
 use crate::commands::args::parse::{parse_bytes, parse_split};
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
@@ -54,6 +55,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
 
 fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     let mut config = args.overrides.read(&folder.join("config.toml"), |_| Ok(()))?;
+    check_network(&config.model, &ModelPath { dir: folder.into(), weights: folder.into() })?;
     // The directory may have been moved since it was written.
     config.run_dir = folder.to_path_buf();
     if let Some(data) = &args.data {

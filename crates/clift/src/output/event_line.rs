@@ -11,7 +11,8 @@ pub(crate) fn step_metrics(step: &StepEvent) -> String {
 pub(crate) fn event_line(event: &Event) -> Option<String> {
     let unit = |stage: Stage| match stage {
         Stage::Stage1 | Stage::Stage2 => "steps",
-        Stage::Clusters | Stage::Eval => "scenes",
+        Stage::Clusters => "context sets",
+        Stage::Eval => "scenes",
     };
     Some(match event {
         Event::Step(_) | Event::Progress { .. } => return None,

@@ -56,7 +56,12 @@ pub(crate) fn check_poses(
     let views: Vec<PixelCamera> = cameras.iter().zip(sizes).map(view).collect();
     let pairs = match_frames(&compared.features, &cameras);
     let distances: Vec<Vec<f64>> = pairs.iter().map(|pair| epipolar_distances(&views, pair)).collect();
-    check.pairs = pairs.iter().zip(&distances).map(|(pair, distances)| pair_check(pair, distances, step)).collect();
+    let pair_check = |(pair, distances): (&FramePair, &Vec<f64>)| PairCheck {
+        frames: pair.frames.map(|frame| frame * step),
+        num_matches: distances.len(),
+        epipolar_px: median(distances),
+    };
+    check.pairs = pairs.iter().zip(&distances).map(pair_check).collect();
     let pooled: Vec<f64> = distances.iter().flat_map(|distances| subsample(distances, MAX_MATCHES)).collect();
     if pooled.len() < MIN_MATCHES {
         let (count, pairs) = (plural(pooled.len(), "matching corner"), plural(pairs.len(), "pair"));
@@ -83,14 +88,6 @@ pub(crate) fn check_poses(
     let FramePair { frames: [first, second], matches } = &pairs[typical];
     let images = [source.frame(scene, first * step).ok()?, source.frame(scene, second * step).ok()?];
     Some(epipolar_image(&images, &PixelCamera::fundamental(&views[*first], &views[*second]), matches))
-}
-
-fn pair_check(pair: &FramePair, distances: &[f64], step: usize) -> PairCheck {
-    PairCheck {
-        frames: pair.frames.map(|frame| frame * step),
-        num_matches: distances.len(),
-        epipolar_px: median(distances),
-    }
 }
 
 /// Adds a note on pairs with large distances in a scene that passes.

@@ -64,7 +64,7 @@ pub(crate) fn triplet_distances(cameras: &[PixelCamera], triplets: &[Vec<Triplet
 /// `wrong` frames place; `None` for a frame with too few.
 pub(crate) fn frame_distances(triplets: &[Vec<Triplet>], distances: &[Vec<f64>], wrong: &[usize]) -> Vec<Option<f64>> {
     let of_frame = |(triplets, distances): (&Vec<Triplet>, &Vec<f64>)| {
-        let is_right = |triplet: &Triplet| !wrong.iter().any(|frame| triplet.is_placed_by(*frame));
+        let is_right = |triplet: &Triplet| !triplet.others.iter().any(|frame| wrong.contains(frame));
         let right = triplets.iter().zip(distances).filter(|(triplet, _)| is_right(triplet));
         let mut right: Vec<f64> = right.map(|(_, px)| *px).collect();
         if right.len() < MIN_TRIPLETS {

@@ -89,9 +89,7 @@ fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut
 
 /// Returns the distance of the centres, and the angle between the orientations in degrees.
 fn camera_distance(a: &Camera, b: &Camera) -> (f64, f64) {
-    let trace = (a.c2w.rotation.transpose() * b.c2w.rotation).diagonal().element_sum();
-    let turn_deg = ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees();
-    (a.c2w.translation.distance(b.c2w.translation), turn_deg)
+    (a.c2w.translation.distance(b.c2w.translation), a.c2w.angle_to(b.c2w).to_degrees())
 }
 
 /// Returns the largest distance of a camera centre from the first.

@@ -31,11 +31,6 @@ pub(crate) struct Triplet {
 }
 
 impl Triplet {
-    /// Returns whether a frame is one of the two that place the points.
-    pub fn is_placed_by(&self, frame: usize) -> bool {
-        self.others.contains(&frame)
-    }
-
     /// Returns the median distance of the corners from where the others place them, in pixels.
     pub fn reprojection_px(&self, cameras: &[PixelCamera]) -> f64 {
         let [first, second] = self.others.map(|frame| &cameras[frame]);
@@ -100,7 +95,7 @@ fn transferred(
 ) -> Option<[f64; 2]> {
     let ray = first.ray(a);
     // Homogeneous pixels of the point with inverse depth `s` on the ray are `direction + s * origin`.
-    let along = |camera: &PixelCamera| [camera.project_direction(ray), camera.project(first.centre())];
+    let along = |camera: &PixelCamera| [camera.project_direction(ray), camera.project(first.c2w.translation)];
     let [direction, origin] = along(second);
     let residual = |pixel: DVec3| [b[0] * pixel.z - pixel.x, b[1] * pixel.z - pixel.y];
     let (offset, slope) = (residual(direction), residual(origin));

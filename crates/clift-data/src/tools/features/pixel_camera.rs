@@ -36,11 +36,6 @@ impl PixelCamera {
         Self::with_intrinsics(intrinsics, self.c2w)
     }
 
-    /// Returns the centre in the world.
-    pub fn centre(&self) -> DVec3 {
-        self.c2w.translation
-    }
-
     /// Returns the direction of a pixel in the world.
     pub fn ray(&self, [x, y]: [f64; 2]) -> DVec3 {
         self.c2w.rotation * (self.inverse_intrinsics * DVec3::new(x, y, 1.0))
@@ -48,7 +43,7 @@ impl PixelCamera {
 
     /// Returns the homogeneous pixel of a point of the world.
     pub fn project(&self, point: DVec3) -> DVec3 {
-        self.project_direction(point - self.centre())
+        self.project_direction(point - self.c2w.translation)
     }
 
     /// Returns the homogeneous pixel of a direction of the world.

@@ -100,8 +100,7 @@ fn tokens_unlike_all_training_tokens_are_coded() {
 fn hostile_words_are_refused_in_bounded_memory() {
     let codec = small();
     let words = codec.encode(&tokens(40, DIM, 7), &ids(40), 120, 0.5).unwrap();
-    let refuse =
-        |words: &[u32], count, patches, step| codec.decode_words(words.to_vec(), count, patches, step).unwrap_err();
+    let refuse = |words: &[u32], count, patches, step| codec.decode(words.to_vec(), count, patches, step).unwrap_err();
     assert!(refuse(&words, 0, 120, 0.5).contains("0 tokens, expected 1 to 120"));
     assert!(refuse(&words, 121, 120, 0.5).contains("121 tokens"));
     assert!(refuse(&words, 1 << 20, 1 << 20, 0.5).contains("expected at most"));

@@ -20,11 +20,6 @@ impl LiftNorm {
         Self { norm: config.has_token_norm().then(|| init.layer_norm(config.dim)) }
     }
 
-    /// Whether the variant has a norm.
-    pub fn is_norm(&self) -> bool {
-        self.norm.is_some()
-    }
-
     /// Returns the tokens that K-means, condenser and renderer read.
     ///
     /// # Shapes

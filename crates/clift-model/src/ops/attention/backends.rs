@@ -27,7 +27,7 @@ impl AttentionKernels for Flex {
         let mut output = vec![0.0; batch * num_queries * dim];
         let mut log_sum = vec![0.0; batch * num_heads * num_queries];
         let set = InstructionSet::detected();
-        attention_forward(set, operands, sizes, inputs.rows(dim), &mut output, Some(&mut log_sum));
+        attention_forward(set, operands, sizes, inputs.rows(dim), &mut output, &mut log_sum);
         let log_sum = tensor(log_sum, [batch, num_heads, num_queries]);
         AttentionOutput { output: tensor(output, [batch, num_queries, dim]), log_sum: Some(log_sum) }
     }

@@ -9,7 +9,7 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IndexingUpdateOp, IntTensor};
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::{FloatDType, Int, Shape, Slice, Tensor, assert_shape};
 
 use crate::ops::autodiff::register;
@@ -81,33 +81,24 @@ pub struct ClusterInputs<B: Backend> {
     pub(crate) num_heads: usize,
 }
 
-macro_rules! cluster_attention_ops {
-    ($backend:ty) => {
-        impl ClusterAttentionOps for $backend {
-            fn cluster_attention(
-                query: FloatTensor<Self>,
-                key_value: FloatTensor<Self>,
-                segment: IntTensor<Self>,
-                num_heads: usize,
-            ) -> FloatTensor<Self> {
-                let [output, _] = Self::attend_clusters(&ClusterInputs { query, key_value, segment, num_heads });
-                output
-            }
-        }
-    };
+impl<B: ClusterAttentionKernels> ClusterAttentionOps for B {
+    fn cluster_attention(
+        query: FloatTensor<Self>,
+        key_value: FloatTensor<Self>,
+        segment: IntTensor<Self>,
+        num_heads: usize,
+    ) -> FloatTensor<Self> {
+        let [output, _] = Self::attend_clusters(&ClusterInputs { query, key_value, segment, num_heads });
+        output
+    }
 }
-cluster_attention_ops!(Flex);
-#[cfg(feature = "ndarray")]
-cluster_attention_ops!(burn::backend::NdArray);
-#[cfg(feature = "wgpu")]
-cluster_attention_ops!(burn::backend::Cube);
 
 #[cfg(feature = "ndarray")]
 impl ClusterAttentionKernels for burn::backend::NdArray {}
 #[cfg(feature = "wgpu")]
 impl ClusterAttentionKernels for burn::backend::Cube {}
 
-impl<B: ClusterAttentionOps + ClusterAttentionKernels, C: CheckpointStrategy> ClusterAttentionOps for Autodiff<B, C> {
+impl<B: ClusterAttentionKernels, C: CheckpointStrategy> ClusterAttentionOps for Autodiff<B, C> {
     fn cluster_attention(
         query: FloatTensor<Self>,
         key_value: FloatTensor<Self>,

@@ -7,7 +7,6 @@ use safetensors::SafeTensors;
 use super::*;
 use crate::codec::token_codec::tests::codec;
 use crate::scene::scene::tests::{scene, with_header};
-use crate::scene::token_coding::TokenCoding;
 
 const STEP: f32 = 0.25;
 
@@ -98,7 +97,6 @@ fn every_flipped_bit_and_every_cut_is_found() {
         let mut damaged = bytes.clone();
         damaged[at] ^= 1 << (at % 8);
         std::fs::write(folder.path(), damaged).unwrap();
-        // A model path that leads nowhere is found before the checksum.
         assert!(Scene::read(&folder.path()).is_err(), "byte {at}");
     }
     for length in 0..bytes.len() {

@@ -190,12 +190,12 @@ fn invalid_headers_are_refused() {
             r#"file version "9", expected "1", "2" or "3"; use the version of clift that"#,
         ),
         (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
-        (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number of pixels"#),
+        (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number"#),
         (r#""renderer":"0123"#, r#""renderer":"zz23"#, "expected 64 hexadecimal digits"),
         // Sizes of the model.
         (r#"num_heads\":2"#, r#"num_heads\":3"#, "`model.num_heads` = 3: write a divisor of model.dim = 8"),
         ("num_heads", "num_hands", "unreadable `model` (unknown field"),
-        (r#"\"dim\":8"#, r#"\"dim\":99999999999"#, "`tokens` is F32 [5, 8], expected F32 [5, 99999999999]"),
+        (r#"\"dim\":8"#, r#"\"dim\":99999999999"#, "`model.dim` = 99999999999: write at most 65536"),
         (r#"patch_size\":8"#, r#"patch_size\":1"#, "ray of token 0: "),
         // Sizes of the views.
         (r#""height":"16""#, r#""height":"17""#, "does not divide into patches"),

@@ -21,9 +21,14 @@ const PARALLEL_LEN: usize = 1 << 15;
 /// Samples `num_clusters` initial centers; fewer if there are fewer distinct tokens.
 pub(crate) fn seed(samples: &Samples, num_clusters: usize, seed: u64, max_table_len: usize) -> Vec<usize> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let pool_len = (max_table_len / samples.len()).max(2 * num_clusters);
+    let pool_len = pool_len(samples.len(), num_clusters, max_table_len);
     let pool = if pool_len < samples.len() { Pool::sample(samples, pool_len, &mut rng) } else { Pool::all(samples) };
     pool.centers(num_clusters, &mut rng)
+}
+
+/// Number of candidates, each with a row of the table.
+pub(crate) fn pool_len(num_tokens: usize, num_clusters: usize, max_table_len: usize) -> usize {
+    (max_table_len / num_tokens).max(2 * num_clusters).min(num_tokens)
 }
 
 /// Candidates for centers.

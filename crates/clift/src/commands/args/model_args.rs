@@ -4,8 +4,8 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use clift_data::{
-    DataError, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
-    open_dataset, open_source,
+    DataError, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
+    open_source,
 };
 use clift_model::{CameraEncoding, ModelConfig, ModelError, ModelPath, TrainedModel};
 use clift_train::{Config, Override};
@@ -46,10 +46,7 @@ impl ModelArgs {
     pub fn new(model: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
         let path = ModelPath::find(model)?;
         let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
-        // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
-        if config.model != (ModelConfig { patch_grids: config.model.patch_grids, ..path.config()? }) {
-            usage_bail!("--set model: the weights were trained with another network; remove the override");
-        }
+        check_network(&config.model, &path)?;
         config.device = args.device.unwrap_or(config.device);
         let folder = folder.map(Path::to_path_buf);
         if folder.is_some() {
@@ -68,8 +65,7 @@ impl ModelArgs {
         let files = if has_files { self.config.data.files.clone() } else { FileOptions::default() };
         // The filters are for training scenes; the user chooses this scene by its key.
         let options = SourceOptions { files, ..SourceOptions::default() };
-        let mut opened = open_source(&DatasetRoot::find(folder)?, split, &options)?;
-        opened.report.notes.retain(|note| note != SAME_SCENES);
+        let opened = open_source(&DatasetRoot::find(folder)?, split, &options)?;
         if opened.report.has_content() {
             print_note(&format!("{}: {}", folder.display(), opened.report));
         }
@@ -100,6 +96,15 @@ impl ModelArgs {
     pub fn open(&self) -> Result<TrainedModel, ModelError> {
         TrainedModel::open(&self.path, &self.config.model, &self.config.device.open()?)
     }
+}
+
+/// Refuses another network than that of the weights. Tensor shapes do not determine the number of heads nor the camera
+/// encoding: a wrong one would silently change the tokens.
+pub fn check_network(model: &ModelConfig, path: &ModelPath) -> anyhow::Result<()> {
+    if *model != (ModelConfig { patch_grids: model.patch_grids, ..path.config()? }) {
+        usage_bail!("--set model: the weights were trained with another network; remove the override");
+    }
+    Ok(())
 }
 
 /// Whether a path is a data set, a capture or its `transforms.json`: neither a run, a model nor a scene file.

@@ -3,9 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use clift_data::{
-    DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SourceOptions, Split, TestScenes, is_dl3dv_key, open_source,
-};
+use clift_data::{DatasetRoot, FileOptions, OpenedSource, SourceOptions, Split, TestScenes, is_dl3dv_key, open_source};
 use clift_train::{Override, parse_config};
 use serde::{Deserialize, Serialize};
 
@@ -90,9 +88,8 @@ pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::
     let mut sources = Vec::new();
     for split in present {
         let mut opened = open_source(&root, split, &SourceOptions { files: files.clone(), ..read_all_options() })?;
-        let is_whole = !opened.has_splits && !has_list;
+        let is_whole = opened.shares_scenes;
         if is_whole {
-            opened.report.notes.retain(|note| note != SAME_SCENES);
             let source = &opened.source;
             if files.test_scenes.is_none() && (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))) {
                 let note = "folders of DL3DV include its benchmark scenes; reserve these for testing with \

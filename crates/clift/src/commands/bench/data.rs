@@ -51,6 +51,9 @@ struct Report {
 
 pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
     let _peak = start_peak();
+    if args.split == Splits::Both {
+        usage_bail!("--split both: one split is measured; write train or test");
+    }
     let Some(split) = open_splits(&args.dir, args.split, &FileOptions::default())?.pop() else {
         usage_bail!("no scenes in {}", args.dir.display());
     };

@@ -8,6 +8,7 @@ use clift_data::{
     CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, replace_file,
     skipped_scenes,
 };
+use clift_eval::file_name;
 use serde::Serialize;
 
 use crate::commands::args::shared_args::JsonArg;
@@ -81,10 +82,9 @@ fn check_split(split: &SplitSource, args: &CheckArgs, report: &mut Report) -> an
     Ok(())
 }
 
-/// Returns `test-KEY.png`, with `_` for characters of the key that a file name cannot contain.
+/// Returns `test-KEY.png`, with the key as a file name.
 fn image_name(split: Option<Split>, key: &str) -> String {
-    let safe = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };
-    let key: String = key.chars().map(safe).collect();
+    let key = file_name(key);
     split.map_or_else(|| format!("{key}.png"), |split| format!("{split}-{key}.png"))
 }
 
@@ -180,6 +180,6 @@ b: note: so much
     #[test]
     fn image_name_stays_in_the_folder() {
         assert_eq!(image_name(Some(Split::Test), "00ff"), "test-00ff.png");
-        assert_eq!(image_name(None, "../1K/a b"), ".._1K_a_b.png");
+        assert_eq!(image_name(None, "../1K/a b"), "_._1K_a_b.png");
     }
 }

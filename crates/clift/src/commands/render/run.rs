@@ -19,7 +19,7 @@ use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::json::write_json;
-use crate::output::stdout::{print_note, print_result};
+use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
 
 /// Frames of `--path interpolate` and `--path orbit` without `--frames`.
@@ -63,9 +63,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     };
     if let Some(effect) = effect {
         let trained = format!("{} x {}", scene.width, scene.height);
-        print_note(&format!(
-            "warning: the network was trained on images of {trained}; frames of {width} x {height} {effect}"
-        ));
+        print_warning(format!("the network was trained on images of {trained}; frames of {width} x {height} {effect}"));
     }
     frames::check_out(&args.out, args.force)?;
     if let Some(video) = args.video.as_deref().filter(|video| !args.force && video.exists()) {
