@@ -122,6 +122,13 @@ fn resumed_runs_need_neither_initial_weights_nor_clusters() {
 }
 
 #[test]
+fn a_begun_run_without_its_config_is_refused() {
+    let place = Place::with(&STAGE_1);
+    std::fs::remove_file(place.at("run/config.toml")).expect("removes");
+    place.train("run", &["seed=1"]).fails_with(1, &["config.toml", "start a new run with --fresh"]);
+}
+
+#[test]
 fn resumed_stage_2_needs_no_initial_weights() {
     let place = Place::new();
     place.copy(&WHOLE, "first");

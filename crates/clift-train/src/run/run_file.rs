@@ -111,7 +111,12 @@ pub(crate) fn open_folder(
     // A run that failed before its first stage may get other settings.
     let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
     let mut file = RunFile::new(options.overfit);
-    if folder.join("config.toml").exists() && has_begun {
+    let written = folder.join("config.toml");
+    if has_begun && !written.exists() {
+        let reason = "missing from a run that has begun; restore the file, or start a new run with --fresh";
+        return Err(TrainError::bad_file("config", &written)(reason));
+    }
+    if has_begun {
         let found = RunFile::read(folder)?;
         if !TrainingData::read(&config.run_dir)?.has_key {
             // A run from before the key resumes with the frames that it was started with.
