@@ -249,6 +249,15 @@ mod tests {
             assert_eq!(check_encoded(bytes).unwrap_err(), expected);
         }
         assert!(check_encoded(b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9").is_err(), "no size");
+        // What cannot be decoded is no frame.
+        let folder = tempfile::tempdir().unwrap();
+        for (width, is_ok) in [(MAX_SIDE as usize, true), (MAX_SIDE as usize + 1, false)] {
+            let wide = encode_png(&ramp(width, 1)).unwrap();
+            let path = folder.path().join("wide.png");
+            std::fs::write(&path, &wide).unwrap();
+            let found = [check_encoded(&wide).is_ok(), read_header(&path).is_ok(), decode_image(&wide, "k", 0).is_ok()];
+            assert_eq!(found, [is_ok; 3], "{width} columns");
+        }
     }
 
     #[test]

@@ -307,6 +307,7 @@ mod tests {
             let message = strided(&shape, &stride).unwrap_err();
             assert!(message.starts_with("bad checkpoint: x [") && message.contains("exceeds its storage"), "{message}");
         }
+        assert_eq!(strided(&[2, 1 << 40, 0], &[1, 0, 1]), Ok(vec![]), "no element, whatever the strides");
         for (shape, stride) in [([1 << 40, 2], [0, 1]), ([4, 4], [1, 1])] {
             assert!(strided(&shape, &stride).unwrap_err().contains("tensor.contiguous()"));
         }
@@ -323,6 +324,13 @@ mod tests {
             let message = read(pickle).unwrap_err();
             assert!(message.contains("exceeds its storage"), "{message}");
         }
+    }
+
+    #[test]
+    fn long_names_which_would_be_copied_at_every_use_are_refused() {
+        let long = |start: &[u8], end: &[u8]| [start, &5000_u32.to_le_bytes(), &[b'x'; 5000], end].concat();
+        assert!(refused(&long(b"}X", b"Ns.")).contains("a key of 5000 bytes, expected at most 4096"));
+        assert!(refused(&long(b"X", b"X\x01\0\0\0y\x93.")).contains("a Python name of more than 1,000 bytes"));
     }
 
     #[test]

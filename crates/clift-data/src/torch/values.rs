@@ -76,7 +76,7 @@ pub struct Tensor {
 }
 
 impl Tensor {
-    /// Returns whether the elements are contiguous in row-major order, as none are.
+    /// Returns whether the elements are contiguous in row-major order; true for an empty tensor, whatever its strides.
     pub fn is_contiguous(&self) -> bool {
         if self.shape.contains(&0) {
             return true;

@@ -128,10 +128,8 @@ impl Evaluator {
         let Some(sheets) = sheets else { return Ok(summary) };
         let complete = folder.join("summary.json");
         // Last: an evaluation with a summary is complete. That of a former evaluation goes first.
-        if let Err(error) = std::fs::remove_file(&complete)
-            && error.kind() != std::io::ErrorKind::NotFound
-        {
-            return Err(EvalError::io("removing the former summary", &complete)(error));
+        if complete.exists() {
+            std::fs::remove_file(&complete).map_err(EvalError::io("removing the former summary", &complete))?;
         }
         sheets.keep()?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
