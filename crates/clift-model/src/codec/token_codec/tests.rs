@@ -104,7 +104,7 @@ fn hostile_words_are_refused_in_bounded_memory() {
     assert!(refuse(&words, 0, 120, 0.5).contains("0 tokens, expected 1 to 120"));
     assert!(refuse(&words, 121, 120, 0.5).contains("121 tokens"));
     assert!(refuse(&words, 1 << 20, 1 << 20, 0.5).contains("expected at most"));
-    let many = [1; 20_000];
+    let many = vec![1; 20_000];
     assert!(refuse(&many, 1 << 26, 1 << 26, 0.5).contains("expected at most 268435456 values"), "1 GiB");
     assert!(refuse(&[1, 0], 1, 1, 0.5).contains("last word"));
     assert!(refuse(&words, 40, 120, -1.0).contains("step -1"));
