@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-VARIANTS = "random,patch,patch_clift,kmeans,clift"
+VARIANTS = "random,tile,tile_clift,kmeans,clift"
 STORAGE = "1/16,1/8,1/4,1/2,1.0"
 
 
@@ -111,9 +111,9 @@ def difference(better: dict[str, float], worse: dict[str, float]) -> tuple[float
 COMPARISONS = [
     ("K-means - random", "kmeans", "random"),
     ("condenser - K-means", "clift", "kmeans"),
-    ("K-means - tiles", "kmeans", "patch"),
-    ("condenser on tiles - tiles", "patch_clift", "patch"),
-    ("condenser - condenser on tiles", "clift", "patch_clift"),
+    ("K-means - tiles", "kmeans", "tile"),
+    ("condenser on tiles - tiles", "tile_clift", "tile"),
+    ("condenser - condenser on tiles", "clift", "tile_clift"),
     ("residuals - equations as printed", "clift", "literal"),
 ]
 
@@ -129,7 +129,7 @@ def report(folders: list[tuple[Path, Path]]) -> None:
     print(f"\nPSNR in dB, {num_scenes} scenes, mean over {len(seeds)} seeds of training\n")
     print("| variant | " + " | ".join(str(count) for count in counts) + " |")
     print("|---|" + "---|" * len(counts))
-    for name in ("random", "patch", "patch_clift", "kmeans", "literal", "clift"):
+    for name in ("random", "tile", "tile_clift", "kmeans", "literal", "clift"):
         cells = []
         for count in counts:
             values = [statistics.fmean(s[name, count].values()) for s in seeds if (name, count) in s]

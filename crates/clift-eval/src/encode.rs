@@ -4,11 +4,11 @@
 use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
 use clift_model::{
     Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneNormalization, TokenCount, TokenKind,
-    TrainedModel, total_variance,
+    TrainedModel,
 };
 
 use crate::error::EvalError;
-use crate::upload::{upload_views, view_cameras};
+use crate::upload::{host_values, upload_views, view_cameras};
 
 /// Settings of [`encode`].
 #[derive(Clone, Debug, PartialEq)]
@@ -62,7 +62,7 @@ impl EncodedScene {
     }
 }
 
-/// Encodes a scene of `reader`. The clusters equal those of `clift eval` for the same contexts and count.
+/// Encodes a scene of `reader`. The groups equal those of `clift eval` for the same contexts and count.
 ///
 /// # Errors
 /// [`ModelError::BadConfig`] for frames that the scene does not have, [`ModelError::BadTokenCount`] for a count above the
@@ -73,10 +73,6 @@ pub fn encode(
     scene: usize,
     options: &EncodeOptions,
 ) -> Result<EncodedScene, EvalError> {
-    if options.grouping != Grouping::Kmeans {
-        let fix = "scene files need K-means tokens: encode with a run with clusters.grouping = \"kmeans\"".into();
-        return Err(bad_config("clusters.grouping", "\"tile\"".into(), fix));
-    }
     let key = reader.source.key(scene);
     let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
     let frames = context_frames(&poses, options.context.as_deref(), options.num_context)?;
@@ -89,19 +85,20 @@ pub fn encode(
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
-    let (clusters, cluster_error) = if model.config.has_latents() {
+    let clusters = if model.config.has_latents() {
         if options.storage.of(num_lift_tokens)? != num_lift_tokens {
             let fix =
                 format!("a scene of lvsm-ed is all its latents, which are not clustered: write {num_lift_tokens}");
             return Err(bad_config("--storage", options.storage.to_string(), fix));
         }
-        (Clusters::new(vec![SceneClusters::identity(num_lift_tokens)])?, 0.0)
+        SceneClusters::identity(num_lift_tokens)
     } else {
-        let fit = options.kmeans.fit(lift.values.clone(), options.storage.of(num_lift_tokens)?, &[seed])?;
-        let error = fit.error(0, total_variance(&lift.values)?[0]);
-        (fit.clusters, error)
+        let grid = [data.height, data.width].map(|side| side / model.config.patch_size);
+        let (count, kmeans) = (options.storage.of(num_lift_tokens)?, (&options.kmeans, seed));
+        options.grouping.group(count, (clip.context.num_views(), grid), kmeans, || lift.values.clone())?
     };
-    let index = clusters.upload(&model.device);
+    let cluster_error = clusters.variance_within(&host_values(&lift)?);
+    let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
     let (kind, tokens) = if model.config.has_latents() {
         (TokenKind::Latents, lift)
     } else if model.has_condenser {
@@ -109,8 +106,7 @@ pub fn encode(
     } else {
         (TokenKind::Kmeans, lift.centroids(&index))
     };
-    let tokens = tokens.values.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
-    let clusters = clusters.scenes()[0].clone();
+    let tokens = host_values(&tokens)?;
     let token_ids = clusters.centroid_index().to_vec();
     debug_assert_eq!(tokens.len(), token_ids.len() * dim, "a row per centroid");
     let scene = Scene {

@@ -67,7 +67,7 @@ pub use report::page::RunDescription;
 pub use report::training::TrainingCurve;
 
 // One scene with every method and token count.
-pub use sweep::eval_models::{EvalModels, stage2_method};
+pub use sweep::eval_models::EvalModels;
 pub use sweep::evaluate_scene::evaluate_scene;
 pub use sweep::held_out_frame::HeldOutFrame;
 pub use sweep::predictions::{ExternalMethod, file_name};

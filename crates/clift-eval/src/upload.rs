@@ -1,8 +1,8 @@
-//! Clips of `clift-data` as tensors of `clift-model`.
+//! Clips of `clift-data` as tensors of `clift-model`, and tokens back on the host.
 
 use burn::tensor::{Device, Tensor};
 use clift_data::ClipViews;
-use clift_model::{Cameras, ViewCamera, Views};
+use clift_model::{Cameras, Tokens, ViewCamera, Views};
 
 use crate::error::EvalError;
 
@@ -17,6 +17,11 @@ use crate::error::EvalError;
 pub fn upload_views(scenes: &[&ClipViews], device: &Device) -> Result<Views, EvalError> {
     let (c2w, intrinsics) = camera_values(scenes);
     Ok(Views::upload(&pixel_values(scenes), &c2w, &intrinsics, shape(scenes), device)?)
+}
+
+/// Returns the values of tokens, `[1, S, D]`, on the host.
+pub(crate) fn host_values(tokens: &Tokens) -> Result<Vec<f32>, EvalError> {
+    tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
 }
 
 /// Uploads only the images, RGB in `[0, 1]`, `[batch, views, height, width, 3]`. See [`upload_views`].

@@ -2,7 +2,7 @@
 //!
 //! The [`Encoder`] turns posed context views into light-field tokens, latent K-means ([`KMeans`]) groups the tokens, and
 //! the [`Condenser`] writes every group into its centroid. To render, the [`Selector`] selects the tokens nearest to a
-//! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Clift`] holds the three networks.
+//! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Clift`] holds them.
 //!
 //! ```
 //! use clift_model::{Cameras, Clift, DeviceName, KMeans, ModelConfig, Views};
@@ -66,12 +66,12 @@ pub use views::upload::{Cameras, Views, upload_images};
 // Tokens: counts, clusters, selection
 pub use tokens::clusters::{ClusterIndex, Clusters, SceneClusters};
 pub use tokens::count::TokenCount;
+pub use tokens::grouping::Grouping;
 pub use tokens::kind::TokenKind;
-pub use tokens::kmeans::fit::{KMeans, KMeansFit, total_variance};
+pub use tokens::kmeans::fit::{KMeans, KMeansFit};
 pub use tokens::selection::rules::{SelectionPreset, SelectionRules};
 pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
-pub use tokens::tiles::{Grouping, tile_clusters};
 // Networks
 pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
 pub use network::camera_encoding::TokenTransforms;

@@ -33,7 +33,9 @@ pub fn fit_token_codec(
         return Err(bad("model.architecture", format!("\"{}\"", config.model.architecture), fix));
     }
     if config.clusters.grouping != Grouping::Kmeans {
-        return Err(bad("clusters.grouping", "\"tile\"", "scene files have K-means tokens: choose a run on K-means"));
+        let grouping: &str = config.clusters.grouping.into();
+        let fix = "the token codec is one of K-means tokens; tokens of other groups are stored in f32, f16 or int8";
+        return Err(bad("clusters.grouping", format!("\"{grouping}\""), fix));
     }
     let eval = EvalConfig { index: None, num_scenes: 0, ..config.eval.clone() };
     let (items, ..) = evaluation_items(&eval, reader, frames)?;

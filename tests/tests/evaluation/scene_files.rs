@@ -125,7 +125,7 @@ fn evaluation_of_selected_tokens_equals_rendering_the_file() {
         let place = Place::with(run);
         let (clip, _) = first_clip(&place);
         place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 4 --tokens f32")).ok();
-        for preset in SelectionPreset::ALL {
+        for &preset in SelectionPreset::ALL {
             let name = preset.name();
             place.eval(&format!("run --render 3,1/2 --selection {name} --out DIR/{name}")).ok();
             for count in [2, 3] {

@@ -16,13 +16,13 @@ fn tiles_and_clusters_have_paired_differences() {
     let place = Place::with(&WHOLE);
     train_on_tiles(&place);
     let words = "run --preset patchwise --with DIR/tiles --storage 1/2 --out DIR/out";
-    place.eval(words).ok().prints("kmeans - patch").prints("patch_clift");
+    place.eval(words).ok().prints("kmeans - tile").prints("tile_clift");
     let summary = place.json("out/summary.json");
     let points = list(&summary["points"]);
     let psnr = |variant: &str| number(point(points, variant, 4), "psnr");
     assert_eq!(points.len(), 4, "what the preset names: {summary}");
     let differences = list(&summary["differences"]);
-    let pairs = [["kmeans", "patch"], ["patch_clift", "patch"], ["clift", "kmeans"], ["clift", "patch_clift"]];
+    let pairs = [["kmeans", "tile"], ["tile_clift", "tile"], ["clift", "kmeans"], ["clift", "tile_clift"]];
     assert_eq!(differences.len(), pairs.len(), "{summary}");
     for [variant, against] in pairs {
         let difference = differences.iter().find(|d| d["variant"] == variant && d["against"] == against).unwrap();
@@ -35,12 +35,12 @@ fn tiles_and_clusters_have_paired_differences() {
     // Without condenser both are of stage 1, which the two runs share: the tiles' own evaluation agrees.
     let own = place.points("tiles/eval");
     let names: Vec<_> = own.iter().map(|point| point["variant"].as_str().unwrap()).collect();
-    assert!(!names.contains(&"clift") && names.contains(&"patch_clift"), "{names:?}");
-    assert_eq!(number(point(&own, "patch", 4), "psnr"), psnr("patch"));
+    assert!(!names.contains(&"clift") && names.contains(&"tile_clift"), "{names:?}");
+    assert_eq!(number(point(&own, "tile", 4), "psnr"), psnr("tile"));
 }
 
 #[test]
-fn tile_runs_encode_nothing_and_refuse_their_kind() {
+fn tile_runs_encode_scenes_and_refuse_their_kind() {
     let place = Place::with(&WHOLE);
     train_on_tiles(&place);
     place
@@ -49,8 +49,10 @@ fn tile_runs_encode_nothing_and_refuse_their_kind() {
     place.eval("run --with DIR/run").fails_with(2, &["trained on the same groups of tokens"]);
     let patchwise = place.eval("run --preset patchwise --storage 1/2");
     patchwise.fails_with(2, &["clusters.grouping = \"tile\"", "--with"]);
-    let encode = "encode DIR/tiles --scene synthetic-0-test-00000 -o DIR/room.clift";
-    place.clift(encode).fails_with(2, &["clusters.grouping"]);
+    let encode = "encode DIR/tiles --scene synthetic-0-test-00000 --storage 4 -o DIR/room.clift";
+    place.clift(encode).ok().prints("variance within clusters");
+    place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/orbit").ok();
+    place.clift("codec DIR/tiles").fails_with(2, &["clusters.grouping", "the token codec is one of K-means tokens"]);
 
     // Another stage 1, another encoder: its condenser has never seen these tokens.
     place.train("other", &["seed=1", "clusters.grouping=\"tile\"", STORAGE]).ok();

@@ -223,12 +223,15 @@ fn sum_bytes(num_values: u64, num_ranks: usize) -> u64 {
 fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let views = &config.data.views;
     let num_context = usize::midpoint(views.min_context, views.max_context);
+    let reads_tokens = config.clusters.grouping.reads_tokens();
     let mut macs = 0.0;
-    for num_context in views.min_context..=views.max_context {
+    for num_context in (views.min_context..=views.max_context).filter(|_| reads_tokens) {
         macs += part_macs(&config.model, Part::Encoder, &scene_with_all_tokens(config, num_context, 0)?);
     }
     macs /= (views.max_context - views.min_context + 1) as f64;
-    let compute_s = if is_timed {
+    let compute_s = if !reads_tokens {
+        Some(0.0)
+    } else if is_timed {
         let counts = cluster_counts(config, num_tokens(config, num_context)?)?;
         let rates = inference_rates(config, num_context, 1, Some(&timed_counts(&counts)))?;
         let kmeans = counts.iter().map(|&count| kmeans_s(&rates, count)).sum::<f64>() / counts.len() as f64;

@@ -51,7 +51,7 @@ pub struct ViewSampler {
     pub inner: InnerViews,
 }
 
-/// Returns whether serde skips the value of a newer key. Settings files from before the key then compare equal.
+/// Returns whether the value is the default, which files omit: caches from before the key then compare equal.
 pub(crate) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }

@@ -41,9 +41,7 @@ fn has_splits(root: &Path) -> bool {
     if present.is_empty() || scene_in(root).is_some() {
         return false;
     }
-    let is_capture = |name: &String| {
-        matches!(scene_in(&root.join(name)), Some(SceneFiles::Transforms(_) | SceneFiles::Colmap { .. }))
-    };
+    let is_capture = |name: &String| scene_in(&root.join(name)).is_some_and(|files| files.is_capture());
     if !present.iter().any(|split| is_capture(split)) {
         return true;
     }

@@ -14,8 +14,8 @@ use rand::RngExt;
 
 use crate::error::EvalError;
 use crate::evaluator::progress::Progress;
-use crate::sweep::compressed_tokens::{host_values, with_values};
-use crate::upload::{upload_cameras, upload_views};
+use crate::sweep::compressed_tokens::with_values;
+use crate::upload::{host_values, upload_cameras, upload_views};
 
 /// Most scenes that transform and distributions are fitted on; each is read twice, with one of the counts.
 const MAX_FITTED_SCENES: usize = 64;

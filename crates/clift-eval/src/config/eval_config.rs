@@ -20,7 +20,7 @@ pub struct EvalConfig {
     pub render: Vec<TokenCount>,
     /// Token selection: `paper`, `global`, `scaled` or `random`.
     pub selection: Selection,
-    /// Rendered methods of `random`, `patch`, `patch_clift`, `kmeans`, `clift` and `lvsm_ed`; empty for all methods with
+    /// Rendered methods of `random`, `tile`, `tile_clift`, `kmeans`, `clift` and `lvsm_ed`; empty for all methods with
     /// weights.
     pub variants: Vec<Method>,
     /// Storage of the tokens, as in a scene file: one of `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss as

@@ -35,7 +35,7 @@ impl Experiment {
                 (&[1.0 / 32.0, 1.0 / 16.0, 0.125, 0.25, 0.5], &[], &[Method::Random, Method::Kmeans, Method::Clift])
             }
             Self::Patchwise => {
-                (&[1.0 / 16.0, 0.125, 0.25], &[], &[Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift])
+                (&[1.0 / 16.0, 0.125, 0.25], &[], &[Method::Tile, Method::TileClift, Method::Kmeans, Method::Clift])
             }
             Self::Budget => (&[0.5], &[0.75, 0.5, 0.25, 0.125], &[Method::Clift]),
         };

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::sync::Mutex;
 
+use clift_model::Grouping;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::error::EvalError;
@@ -19,9 +20,11 @@ pub enum Method {
     /// Centroid tokens of K-means clusters, without condenser.
     Kmeans,
     /// Centre tokens of rectangular tiles of the context views, without condenser.
-    Patch,
+    #[serde(alias = "patch")]
+    Tile,
     /// Condensed tiles, with a condenser trained on tiles.
-    PatchClift,
+    #[serde(alias = "patch_clift")]
+    TileClift,
     /// A random subset of all tokens.
     Random,
     /// All latents of LVSM's encoder-decoder, a network of its own.
@@ -40,8 +43,8 @@ impl Method {
     pub const OWN: [Self; 8] = [
         Self::Clift,
         Self::Kmeans,
-        Self::Patch,
-        Self::PatchClift,
+        Self::Tile,
+        Self::TileClift,
         Self::Random,
         Self::LvsmEd,
         Self::NearestView,
@@ -54,6 +57,28 @@ impl Method {
             Self::External(name) => name.as_str(),
             own => own.into(),
         }
+    }
+
+    /// Returns the grouping whose groups the tokens of a method stand for; `None` of methods without groups.
+    pub const fn grouping(self) -> Option<Grouping> {
+        match self {
+            Self::Clift | Self::Kmeans => Some(Grouping::Kmeans),
+            Self::TileClift | Self::Tile => Some(Grouping::Tile),
+            Self::Random | Self::LvsmEd | Self::NearestView | Self::MeanImage | Self::External(_) => None,
+        }
+    }
+
+    /// Returns the method whose tokens are groups of such a grouping, condensed by stage 2.
+    pub const fn condensed(grouping: Grouping) -> Self {
+        match grouping {
+            Grouping::Kmeans => Self::Clift,
+            Grouping::Tile => Self::TileClift,
+        }
+    }
+
+    /// Returns whether stage 2 condenses the groups of a method.
+    pub fn is_condensed(self) -> bool {
+        self.grouping().is_some_and(|grouping| self == Self::condensed(grouping))
     }
 }
 
@@ -119,7 +144,10 @@ mod tests {
             assert_eq!(serde_json::to_value(method).unwrap(), method.name());
             assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
         }
-        assert_eq!(Method::OWN.map(Method::name)[3..7], ["patch_clift", "random", "lvsm_ed", "nearest_view"]);
+        assert_eq!(Method::OWN.map(Method::name)[3..7], ["tile_clift", "random", "lvsm_ed", "nearest_view"]);
         assert!(serde_json::from_value::<Method>("".into()).is_err());
+        // Of former evaluations.
+        let former = ["patch", "patch_clift"].map(|name| serde_json::from_value::<Method>(name.into()).unwrap());
+        assert_eq!(former, [Method::Tile, Method::TileClift]);
     }
 }

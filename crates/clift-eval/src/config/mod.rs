@@ -1,8 +1,8 @@
 //! Evaluation settings.
 //!
 //! - `method`: rendering methods and baselines
-//! - `token_selection`: token selection settings
-//! - `split`: the evaluated scenes and frames, as related to training
+//! - `token_selection`: the rule by which rendered tokens are selected
+//! - `split`: the evaluated scenes and frames, and whether training has seen them
 //! - `eval_config`: the `[eval]` section
 //! - `experiment`: the paper's experiments as settings
 

@@ -1,4 +1,4 @@
-//! The evaluated scenes and frames, as related to training.
+//! The evaluated scenes and frames, and whether training has seen them.
 
 use std::fmt;
 

@@ -273,7 +273,7 @@ impl Evaluator {
             }
             Method::LvsmEd => "the run is no LVSM; add runs with model.architecture = \"lvsm-ed\" with --with",
             Method::Clift => "stage 2 was not trained on K-means clusters; remove the method",
-            Method::PatchClift => {
+            Method::TileClift => {
                 "stage 2 was not trained on tiles; train a run with clusters.grouping = \"tile\" and \
                  stage1.init_from = this run, and pass the new run with --with"
             }

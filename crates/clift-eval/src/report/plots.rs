@@ -54,14 +54,14 @@ fn look(summary: &Summary, method: Method) -> Look {
         Method::Clift => Look::ALL[0],
         Method::Kmeans => Look::ALL[1],
         Method::Random => Look::ALL[2],
-        // Not measured together: LVSM is compared with the paper's method, tiles with K-means.
-        Method::Patch | Method::LvsmEd => Look::ALL[3],
+        Method::Tile => Look::ALL[3],
         // Baselines are levels, not series.
-        Method::PatchClift | Method::NearestView | Method::MeanImage => Look::ALL[4],
-        Method::External(_) => {
+        Method::TileClift | Method::NearestView | Method::MeanImage => Look::ALL[4],
+        Method::LvsmEd | Method::External(_) => {
+            let is_other = |method: &Method| matches!(method, Method::LvsmEd | Method::External(_));
             let methods = summary.points.iter().map(|point| point.key.method);
-            let external: BTreeSet<_> = methods.filter(|method| matches!(method, Method::External(_))).collect();
-            let index = external.into_iter().position(|other| other == method).unwrap_or_default();
+            let others: BTreeSet<_> = methods.filter(is_other).collect();
+            let index = others.into_iter().position(|other| other == method).unwrap_or_default();
             Look::OTHERS[index % Look::OTHERS.len()]
         }
     }

@@ -67,7 +67,7 @@ fn image_rows(figure: &SceneFigure) -> io::Result<Markup> {
     };
     Ok(html! {
         (row("target", target))
-        @for method in [Method::Clift, Method::Kmeans, Method::PatchClift, Method::Patch, Method::Random, Method::LvsmEd] {
+        @for method in [Method::Clift, Method::Kmeans, Method::TileClift, Method::Tile, Method::Random, Method::LvsmEd] {
             (strip(method.name(), &of(method).filter(|image| image.key.is_whole()).collect::<Vec<_>>())?)
             @if Some(method) == best { (errors(&figure.images)?) }
         }

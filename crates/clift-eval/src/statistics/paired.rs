@@ -17,9 +17,9 @@ use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 const ORDERINGS: [[Method; 2]; 6] = [
     [Method::Kmeans, Method::Random],
     [Method::Clift, Method::Kmeans],
-    [Method::Kmeans, Method::Patch],
-    [Method::PatchClift, Method::Patch],
-    [Method::Clift, Method::PatchClift],
+    [Method::Kmeans, Method::Tile],
+    [Method::TileClift, Method::Tile],
+    [Method::Clift, Method::TileClift],
     [Method::Clift, Method::LvsmEd],
 ];
 

@@ -42,7 +42,7 @@ impl EvalKey {
 /// Returns the main method among the keys: a condensed method, else K-means, else random tokens, else LVSM.
 pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
     let found: BTreeSet<Method> = keys.into_iter().map(|key| key.method).collect();
-    [Method::Clift, Method::PatchClift, Method::Kmeans, Method::Random, Method::LvsmEd]
+    [Method::Clift, Method::TileClift, Method::Kmeans, Method::Random, Method::LvsmEd]
         .into_iter()
         .find(|method| found.contains(method))
 }

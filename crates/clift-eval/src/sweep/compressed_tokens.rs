@@ -13,7 +13,7 @@ use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
-use crate::upload::view_cameras;
+use crate::upload::{host_values, view_cameras};
 
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
@@ -30,25 +30,26 @@ impl<'a> CompressedTokens<'a> {
     pub fn new(
         method: Method,
         models: &'a EvalModels,
-        (lift, index): (&Tokens, &LazyClusters),
-        storage: TokenCoding,
+        (lift, clusters): (&Tokens, &LazyClusters),
+        coding: TokenCoding,
         (clip, model_path): (&Clip, &str),
     ) -> Result<Self, EvalError> {
         let model = models.for_method(method).ok_or(EvalError::NoModel { method: method.name() })?;
-        if method == Method::Random {
-            let ids = random_subset(lift.dims()[1], index.num_clusters, item_rng(index.seed, 0, 0, 0, "random subset"));
+        let Some(grouping) = method.grouping() else {
+            let ids =
+                random_subset(lift.dims()[1], clusters.num_clusters, item_rng(clusters.seed, 0, 0, 0, "random subset"));
             return Ok(Self { tokens: lift.select(&ids), ids, model, file_bytes: None });
-        }
-        let is_tiled = matches!(method, Method::Patch | Method::PatchClift);
-        let clusters = if is_tiled { index.tiles()? } else { index.clusters()? };
+        };
+        let clusters = clusters.groups(grouping)?;
         let uploaded = clusters.upload(&model.device);
-        let tokens = match method {
-            Method::Clift | Method::PatchClift => model.network.compress(lift.clone(), &uploaded),
-            _ => lift.centroids(&uploaded),
+        let tokens = if method.is_condensed() {
+            model.network.compress(lift.clone(), &uploaded)
+        } else {
+            lift.centroids(&uploaded)
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();
         let (num_tokens, num_views) = (ids.len(), clip.context.num_views());
-        let (tokens, bytes) = match storage {
+        let (tokens, bytes) = match coding {
             TokenCoding::Plain(format) => {
                 let bytes = scene_file_bytes(&model.config, num_tokens, num_views, format);
                 (rounded(tokens, format)?, bytes)
@@ -93,11 +94,6 @@ fn rounded(tokens: Tokens, format: TokenFormat) -> Result<Tokens, EvalError> {
     }
     let values = format.round(&host_values(&tokens)?, tokens.dims()[2])?;
     Ok(with_values(tokens, values))
-}
-
-/// Returns the values of tokens, `[1, S, D]`, on the host.
-pub(crate) fn host_values(tokens: &Tokens) -> Result<Vec<f32>, EvalError> {
-    tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
 }
 
 /// Returns tokens of other values.

@@ -45,26 +45,18 @@ impl EvalModels {
     /// Returns the model that renders a method, one of several of LVSM; `None` without one and for baselines.
     pub fn for_method(&self, method: Method) -> Option<&TrainedModel> {
         match method {
-            Method::Random | Method::Patch | Method::Kmeans => Some(&self.stage1).filter(|_| !self.is_of_latents()),
+            Method::Random | Method::Tile | Method::Kmeans => Some(&self.stage1).filter(|_| !self.is_of_latents()),
             Method::LvsmEd => self.lvsm.first(),
             Method::Clift => self.stage2.as_ref(),
-            Method::PatchClift => self.stage2_tiles.as_ref(),
+            Method::TileClift => self.stage2_tiles.as_ref(),
             Method::NearestView | Method::MeanImage | Method::External(_) => None,
         }
     }
 
     /// Returns the default methods: every method with a model. Uncondensed tiles need condensed tiles beside them.
     pub fn methods(&self) -> Vec<Method> {
-        let all = [Method::Random, Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift, Method::LvsmEd];
-        let is_wanted = |method: &Method| *method != Method::Patch || self.stage2_tiles.is_some();
+        let all = [Method::Random, Method::Tile, Method::TileClift, Method::Kmeans, Method::Clift, Method::LvsmEd];
+        let is_wanted = |method: &Method| *method != Method::Tile || self.stage2_tiles.is_some();
         all.into_iter().filter(|method| self.for_method(*method).is_some()).filter(is_wanted).collect()
-    }
-}
-
-/// Returns the method of a stage 2 that is trained on such groups of tokens.
-pub const fn stage2_method(grouping: Grouping) -> Method {
-    match grouping {
-        Grouping::Kmeans => Method::Clift,
-        Grouping::Tile => Method::PatchClift,
     }
 }

@@ -5,7 +5,7 @@ use std::collections::btree_map::Entry;
 use std::time::Instant;
 
 use clift_data::{Clip, derive_seed, median};
-use clift_model::{Cameras, FlopConvention, TokenCoding, Tokens, TrainedModel, Views};
+use clift_model::{Cameras, FlopConvention, Grouping, TokenCoding, Tokens, TrainedModel, Views};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
@@ -85,9 +85,10 @@ fn add_jobs<'a>(
     let TargetRenderer { clip, sweep, .. } = *renderer;
     let stage1 = &models.stage1.network;
     let features = stage1.features(context);
-    // A stage 2 with its own token norm clusters and condenses the tokens of its own norm.
-    let normed: Vec<(Method, Tokens)> = [Method::Clift, Method::PatchClift]
+    // Stage 2 may have trained its own token norm; its tokens are then grouped and condensed after that norm.
+    let normed: Vec<(Method, Tokens)> = Method::OWN
         .into_iter()
+        .filter(|method| method.is_condensed())
         .filter_map(|method| Some((method, models.for_method(method)?)))
         .filter(|(_, model)| model.config.has_token_norm())
         .map(|(method, model)| (method, model.network.normalize(features.clone())))
@@ -99,7 +100,7 @@ fn add_jobs<'a>(
     let views = (clip.context.num_views(), grid);
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
-        let index = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
+        let clusters = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
         let own_norm: Vec<_> = normed
             .iter()
             .map(|(of, lift)| {
@@ -108,12 +109,13 @@ fn add_jobs<'a>(
             .collect();
         for &method in sweep.methods.iter().filter(|method| **method != Method::LvsmEd) {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
-            let (lift, index) = own.map_or((&lift, &index), |(_, lift, index)| (*lift, index));
-            for (i, tokens) in sweep.formats(method).into_iter().enumerate() {
+            let (lift, clusters) = own.map_or((&lift, &clusters), |(_, lift, clusters)| (*lift, clusters));
+            for (i, coding) in sweep.formats(method).into_iter().enumerate() {
                 let kept_views = if i == 0 { kept_views } else { &[] };
-                let stored = CompressedTokens::new(method, models, (lift, index), tokens, (clip, &sweep.model_path))?;
+                let stored =
+                    CompressedTokens::new(method, models, (lift, clusters), coding, (clip, &sweep.model_path))?;
                 let whole =
-                    EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(tokens) };
+                    EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(coding) };
                 let first = jobs.len();
                 let all = RenderJob::new(whole, &stored, None, kept_views);
                 renderer.warm_up(&all, metrics)?;
@@ -140,8 +142,8 @@ fn add_jobs<'a>(
         }
         if !kept_views.is_empty() {
             let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
-            let index = own.map_or(&index, |(.., index)| index);
-            results.clusters.push(index.clusters()?.scenes()[0].clone());
+            let clusters = own.map_or(&clusters, |(.., clusters)| clusters);
+            results.clusters.push(clusters.groups(Grouping::Kmeans)?.scenes()[0].clone());
         }
     }
     Ok(())

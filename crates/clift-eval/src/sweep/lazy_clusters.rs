@@ -1,23 +1,23 @@
-//! Clusters or tiles of a scene's tokens, computed for the first method that needs them.
+//! Groups of a scene's tokens, computed for the first method that needs them.
 
 use std::cell::OnceCell;
 
 use burn::tensor::Tensor;
-use clift_model::{Clusters, KMeans, tile_clusters};
+use clift_model::{Clusters, Grouping, KMeans};
+use strum::EnumCount;
 
 use crate::error::EvalError;
 
-/// Clusters and tiles of one count, each computed on first use.
+/// The groups of one count, by every grouping, each computed on first use.
 pub(crate) struct LazyClusters<'a> {
     kmeans: &'a KMeans,
-    /// The clustered tokens, `[1, N, D]`.
+    /// The grouped tokens, `[1, N, D]`.
     lift: &'a Tensor<3>,
     pub num_clusters: usize,
     pub seed: u64,
     /// Number of context views, and rows and columns of patches of a view.
     views: (usize, [usize; 2]),
-    clusters: OnceCell<Clusters>,
-    tiles: OnceCell<Clusters>,
+    groups: [OnceCell<Clusters>; Grouping::COUNT],
 }
 
 impl<'a> LazyClusters<'a> {
@@ -28,30 +28,17 @@ impl<'a> LazyClusters<'a> {
         num_clusters: usize,
         seed: u64,
     ) -> Self {
-        Self { kmeans, lift, num_clusters, seed, views, clusters: OnceCell::new(), tiles: OnceCell::new() }
+        Self { kmeans, lift, num_clusters, seed, views, groups: Default::default() }
     }
 
-    pub fn tiles(&self) -> Result<&Clusters, EvalError> {
-        computed_once(&self.tiles, || {
-            let (num_views, grid) = self.views;
-            Ok(Clusters::new(vec![tile_clusters(num_views, grid, self.num_clusters)?])?)
-        })
+    pub fn groups(&self, grouping: Grouping) -> Result<&Clusters, EvalError> {
+        let cell = &self.groups[grouping as usize];
+        if let Some(groups) = cell.get() {
+            return Ok(groups);
+        }
+        let tokens = || self.lift.clone();
+        let groups = grouping.group(self.num_clusters, self.views, (self.kmeans, self.seed), tokens)?;
+        let groups = Clusters::new(vec![groups])?;
+        Ok(cell.get_or_init(|| groups))
     }
-
-    pub fn clusters(&self) -> Result<&Clusters, EvalError> {
-        computed_once(&self.clusters, || {
-            Ok(self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?.clusters)
-        })
-    }
-}
-
-fn computed_once(
-    cell: &OnceCell<Clusters>,
-    compute: impl FnOnce() -> Result<Clusters, EvalError>,
-) -> Result<&Clusters, EvalError> {
-    if let Some(clusters) = cell.get() {
-        return Ok(clusters);
-    }
-    let clusters = compute()?;
-    Ok(cell.get_or_init(|| clusters))
 }

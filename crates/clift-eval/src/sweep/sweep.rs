@@ -34,8 +34,7 @@ pub struct Sweep {
     pub external_methods: Vec<ExternalMethod>,
     /// Whether the device is a CPU, where the peak memory of the process includes the tensors.
     pub is_cpu: bool,
-    /// Timed views of every key that an evaluation has at least, by rendering views of the first scenes several times; 0 renders
-    /// every view once.
+    /// Least number of timed views per key: views of the first scenes are rendered again to reach it. 0 renders every view once.
     pub min_timed_views: usize,
     /// Seed of K-means and of random tokens. Every scene derives a seed of its own from this seed and its key.
     pub seed: u64,

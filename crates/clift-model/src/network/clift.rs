@@ -15,7 +15,7 @@ use crate::network::tokens::Tokens;
 use crate::tokens::clusters::ClusterIndex;
 use crate::views::upload::{Cameras, Views};
 
-/// Encoder, condenser and renderer. Stage 1 trains encoder and renderer, stage 2 condenser and renderer.
+/// Encoder, token norm, condenser and renderer. Stage 1 trains encoder and renderer, stage 2 condenser and renderer.
 #[derive(Module, Debug)]
 pub struct Clift {
     /// Context views to light-field tokens.

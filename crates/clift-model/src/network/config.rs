@@ -58,7 +58,7 @@ impl Default for ModelConfig {
     }
 }
 
-/// Whether files do not name the value.
+/// Whether the value is the default, which files omit.
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }

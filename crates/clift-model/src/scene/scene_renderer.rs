@@ -274,7 +274,7 @@ mod tests {
                 // Matrix products of eight views have other block sizes than those of one view.
                 assert_equals_single_frames(&device, &config, SelectionPreset::Paper, 12, 1e-5);
             }
-            for preset in SelectionPreset::ALL {
+            for &preset in SelectionPreset::ALL {
                 assert_equals_single_frames(&Device::flex(), &config, preset, 5, 0.0);
             }
         }

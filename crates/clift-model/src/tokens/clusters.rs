@@ -54,6 +54,33 @@ impl SceneClusters {
     pub fn centroid_index(&self) -> &[u32] {
         &self.centroid_index
     }
+
+    /// Returns the variance of tokens `[num_tokens, dim]` within the clusters, as a share of their total variance; 0 of equal
+    /// tokens.
+    ///
+    /// # Panics
+    /// If there are not `num_tokens` rows.
+    pub fn variance_within(&self, tokens: &[f32]) -> f64 {
+        let num_tokens = self.assignment.len();
+        assert!(num_tokens > 0 && tokens.len().is_multiple_of(num_tokens), "a row per token");
+        let rows = || tokens.chunks((tokens.len() / num_tokens).max(1));
+        let around_means = |group: &dyn Fn(usize) -> usize, num_groups: usize| {
+            let mut sums = vec![vec![0.0; tokens.len() / num_tokens]; num_groups];
+            let mut counts = vec![0.0; num_groups];
+            for (token, row) in rows().enumerate() {
+                counts[group(token)] += 1.0;
+                sums[group(token)].iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
+            }
+            let distance = |(token, row): (usize, &[f32])| {
+                let (sum, count) = (&sums[group(token)], counts[group(token)]);
+                row.iter().zip(sum).map(|(&value, sum)| (f64::from(value) - sum / count).powi(2)).sum::<f64>()
+            };
+            rows().enumerate().map(distance).sum::<f64>()
+        };
+        let total = around_means(&|_| 0, 1);
+        let within = around_means(&|token| self.assignment[token] as usize, self.centroid_index.len());
+        if total > 0.0 { within / total } else { 0.0 }
+    }
 }
 
 /// Clusters of a batch of scenes with the same counts.
@@ -169,6 +196,16 @@ impl ClusterIndex {
 mod tests {
     use super::*;
     use crate::testing::to_vec;
+
+    #[test]
+    fn variance_within_is_a_share_of_the_total() {
+        // Means (1, 0) and (7, 2) of the clusters, (4, 1) of all tokens.
+        let clusters = SceneClusters::new(vec![0, 1, 0, 1], vec![0, 1]).unwrap();
+        let tokens = [0.0, 0.0, 7.0, 4.0, 2.0, 0.0, 7.0, 0.0];
+        assert_eq!(clusters.variance_within(&tokens), (2.0 + 8.0) / (17.0 + 18.0 + 5.0 + 10.0));
+        assert_eq!(clusters.variance_within(&[3.0; 8]), 0.0, "equal tokens");
+        assert_eq!(SceneClusters::identity(4).variance_within(&tokens), 0.0);
+    }
 
     #[test]
     fn inconsistent_indices_are_refused() {

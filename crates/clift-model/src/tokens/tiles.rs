@@ -5,21 +5,8 @@
 //! tile is the token in its middle.
 // N tokens, S tiles
 
-use serde::{Deserialize, Serialize};
-
 use crate::error::ModelError;
 use crate::tokens::clusters::SceneClusters;
-
-/// Grouping of the tokens of a scene.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Grouping {
-    /// Latent K-means, the method of the paper.
-    #[default]
-    Kmeans,
-    /// Tiles of every view, the baseline of the paper.
-    Tile,
-}
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Tile {
@@ -38,7 +25,7 @@ struct Tile {
 ///
 /// # Errors
 /// [`ModelError::BadClusters`] for fewer tiles than views, or more tiles than tokens.
-pub fn tile_clusters(num_views: usize, grid: [usize; 2], num_tiles: usize) -> Result<SceneClusters, ModelError> {
+pub(crate) fn tile_clusters(num_views: usize, grid: [usize; 2], num_tiles: usize) -> Result<SceneClusters, ModelError> {
     let [rows, columns] = grid;
     let num_tokens = num_views * rows * columns;
     if num_views == 0 || num_tiles < num_views || num_tiles > num_tokens {

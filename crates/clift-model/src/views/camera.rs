@@ -20,6 +20,11 @@ impl ViewCamera {
         [3, 7, 11].map(|i| self.c2w[i])
     }
 
+    /// Returns the unit direction in which the camera looks.
+    pub fn axis(&self) -> [f64; 3] {
+        [2, 6, 10].map(|i| self.c2w[i])
+    }
+
     /// Returns the unit direction through column `x` and row `y` of the image, in pixels; the center of pixel (i, j) is
     /// (i + 0.5, j + 0.5).
     pub fn direction(&self, x: f64, y: f64) -> [f64; 3] {

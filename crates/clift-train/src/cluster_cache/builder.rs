@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use burn::tensor::Device;
 use clift_data::{ClipReader, DataError, ViewIndices, derive_seed, item_rng, uniform_below};
 use clift_eval::upload_views;
-use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
+use clift_model::{Encoder, SceneClusters};
 
 use crate::cluster_cache::cache::{ClusterCache, VERSION, settings};
 use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
@@ -107,18 +107,11 @@ impl ClusterBuilder<'_> {
         let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
         let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
         let count = grid[uniform_below(&mut rng, grid.len())].of(num_tokens)?;
-        let clusters = match grouping {
-            Grouping::Kmeans => {
-                // Tokens before the token norm, as in the reference: stage 2 trains this norm.
-                let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
-                let fit = kmeans.fit(lift.values, count, &[derive_seed(seed, &clip.key)])?;
-                fit.clusters.scenes()[0].clone()
-            }
-            Grouping::Tile => {
-                let grid = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
-                tile_clusters(num_context, grid, count)?
-            }
-        };
-        Ok((context, clusters))
+        let patches = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
+        // Tokens before the token norm, as in the reference: stage 2 trains this norm.
+        let context_views = upload_views(&[&clip.context], device)?;
+        let tokens = || encoder.forward(&context_views).values;
+        let kmeans = (kmeans, derive_seed(seed, &clip.key));
+        Ok((context, grouping.group(count, (num_context, patches), kmeans, tokens)?))
     }
 }

@@ -82,8 +82,11 @@ impl ClusterCache {
                 format!("its tokens are of encoder {}, the run's is {}", short(&index.encoder), short(encoder));
             return Err(stale(reason));
         }
-        if index.settings != settings(config) {
-            return Err(stale("the settings of data, sampler or K-means differ from those of this run".into()));
+        let wanted = settings(config);
+        if index.settings != wanted {
+            let values = [&index.settings, &wanted].map(|text| serde_json::from_str(text).unwrap_or_default());
+            let key = first_difference(&values).unwrap_or_default();
+            return Err(stale(format!("{key} differs from that of this run")));
         }
         if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
             let CacheEntry { key, num_tokens, num_storage_tokens, .. } = entry;
@@ -153,6 +156,14 @@ pub(crate) fn settings(config: &Config) -> String {
     .to_string()
 }
 
+/// Returns the first key, by path, with two values.
+fn first_difference(values: &[serde_json::Value; 2]) -> Option<String> {
+    let [Some(one), Some(other)] = values.each_ref().map(serde_json::Value::as_object) else { return None };
+    let key = one.keys().chain(other.keys()).find(|key| one.get(*key) != other.get(*key))?;
+    let below = [one, other].map(|object| object.get(key).cloned().unwrap_or_default());
+    Some(first_difference(&below).map_or_else(|| key.clone(), |path| format!("{key}.{path}")))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -182,6 +193,16 @@ mod tests {
             let expected = format!("scene a has {num_storage_tokens} clusters of {num_tokens} tokens");
             assert!(message.contains(&expected), "{message}");
         }
+    }
+
+    #[test]
+    fn the_first_other_setting_is_named() {
+        let mut config = Config::default();
+        let before = settings(&config);
+        config.clusters.kmeans.max_iterations += 1;
+        let values = [before, settings(&config)].map(|text| serde_json::from_str(&text).expect("JSON"));
+        assert_eq!(first_difference(&values).as_deref(), Some("clusters.kmeans.max_iterations"));
+        assert_eq!(first_difference(&[values[0].clone(), values[0].clone()]), None);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Offline K-means of the training set.
+//! The groups of the training set's tokens, made before stage 2.
 //!
 //! - `resume_log`: finished sets of a build
 //! - `cache`: entries and index; read the finished cache

@@ -229,7 +229,7 @@ impl Default for Stage1Config {
     }
 }
 
-/// The offline cluster cache: latent K-means of the trained encoder's tokens.
+/// The offline cluster cache: groups of the trained encoder's tokens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClustersConfig {

@@ -6,6 +6,7 @@
 //! - `errors`: unknown keys, wrong values, ranges
 //! - `config`: every key of an experiment
 //! - `checks`: values that must fit each other
+//! - `former_names`: keys and values that were renamed
 //! - `parse`: read a config file
 
 pub(crate) mod checks;

@@ -1,7 +1,7 @@
 //! Largest tensor of every part of a run; refuses tensors that a device cannot hold.
 
 use burn::tensor::Device;
-use clift_model::{Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes};
+use clift_model::{Grouping, Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
@@ -118,7 +118,7 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
     let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
     if config.model.has_latents() {
         all.extend(of(Part::Renderer, &scene));
-    } else if matches!(part, Stage::Clusters | Stage::Eval) {
+    } else if part == Stage::Eval || part == Stage::Clusters && config.clusters.grouping == Grouping::Kmeans {
         all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
     }
     if matches!(part, Stage::Stage2 | Stage::Eval) && !config.model.has_latents() {

@@ -76,11 +76,14 @@ pub fn eval_sizes(config: &Config) -> Sweep {
     if config.model.has_latents() {
         return config.sweep(config.eval_storage(), vec![Method::LvsmEd]);
     }
-    let methods = [Method::Random, Method::Kmeans, Method::Clift];
-    let mut variants = config.eval.variants.clone();
-    // The condenser of tiles belongs to another run.
-    variants.retain(|variant| *variant != Method::PatchClift);
-    config.sweep(config.eval.storage.clone(), if variants.is_empty() { methods.to_vec() } else { variants })
+    let condensed = Method::condensed(config.clusters.grouping);
+    let mut methods = config.eval.variants.clone();
+    // The condenser of another grouping belongs to another run.
+    methods.retain(|method| !method.is_condensed() || *method == condensed);
+    if methods.is_empty() {
+        methods = vec![Method::Random, Method::Kmeans, condensed];
+    }
+    config.sweep(config.eval.storage.clone(), methods)
 }
 
 /// Whether an evaluation measures LPIPS.

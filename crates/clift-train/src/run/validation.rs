@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use clift_data::{ClipReader, Split};
 use clift_eval::{
     EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, RunDescription, SceneFigures,
-    SceneLimits, Summary, Sweep, stage2_method,
+    SceneLimits, Summary, Sweep,
 };
 use clift_model::{Clift, TokenCoding, TokenCount, TrainedModel};
 
@@ -92,7 +92,7 @@ impl<'a> Validation<'a> {
         let mut models = EvalModels::new(model.clone());
         let (storage, method) = if is_stage2 {
             models.set_stage2(clusters.grouping, model);
-            (eval.validation_storage, stage2_method(clusters.grouping))
+            (eval.validation_storage, Method::condensed(clusters.grouping))
         } else {
             (TokenCount::Share(1.0), if sizes.has_latents() { Method::LvsmEd } else { Method::Kmeans })
         };

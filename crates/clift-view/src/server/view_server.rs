@@ -84,7 +84,7 @@ impl ViewServer {
         let hello = Hello {
             scenes: scenes.keys(),
             device: device_name.to_string(),
-            selections: SelectionPreset::ALL.map(SelectionPreset::name).to_vec(),
+            selections: SelectionPreset::ALL.iter().map(|preset| preset.name()).collect(),
             default_selection: SelectionPreset::default().name(),
             precisions: (Precision::ALL.into_iter())
                 .filter(|one| one.check("precision", &device).is_ok())

@@ -199,7 +199,7 @@ mod tests {
     fn photo(folder: &Path, name: &str, image: &RgbImage, lens: Lens) -> Photo {
         let path = folder.join(name);
         std::fs::write(&path, encode_png(image).unwrap()).unwrap();
-        Photo::new(path, Pose::IDENTITY, K, lens, true).unwrap()
+        Photo::new(path, Pose::IDENTITY, K, None, (lens, true)).unwrap()
     }
 
     fn cache(folder: &Path, max_bytes: u64) -> ImageCache {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
 use crate::files::listing::file_names;
+use crate::sources::photos::photo::NO_IMAGE;
 
 /// Extensions of the formats that can be decoded.
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
@@ -31,7 +32,7 @@ impl ImageFolders {
     /// # Errors
     /// A reason for the skip report.
     pub fn find(&mut self, path: &Path) -> Result<PathBuf, String> {
-        let missing = || "without an image".to_owned();
+        let missing = || NO_IMAGE.to_owned();
         let (Some(parent), Some(name)) = (path.parent(), path.file_name().and_then(|name| name.to_str())) else {
             return Err(missing());
         };

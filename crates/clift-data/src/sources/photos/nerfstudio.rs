@@ -18,7 +18,7 @@ use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
 use crate::image::codec::read_header;
 use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoOptions, PhotoScene};
 
 /// Largest size of a `transforms.json`, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
@@ -194,9 +194,9 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
         let rows = entry.c2w_rows().map_err(in_frame)?;
         let photo = Pose::from_opengl(&rows)
-            .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, lens, options.undistort))
+            .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)))
             .map_err(PhotoScene::in_frame(path, name))?;
-        scene.photos.push(Photo { shape: given.map(|[width, height]| width / height), ..photo });
+        scene.photos.push(photo);
     }
     scene.num_without_camera = images.folders.num_unrequested();
     Ok(scene)
@@ -235,7 +235,7 @@ impl ImageLocator<'_> {
         }
         let given = self.folder.join(named);
         let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
-            return Err("without an image".into());
+            return Err(NO_IMAGE.into());
         };
         if self.folders.has(parent) {
             return self.folders.find(&given);
@@ -253,7 +253,7 @@ impl ImageLocator<'_> {
         if is_absolute(named) {
             return self.folders.find(&self.folder.join(name));
         }
-        Err("without an image".into())
+        Err(NO_IMAGE.into())
     }
 
     /// Returns the configured image folder, or the first existing default folder.

@@ -52,10 +52,13 @@ pub(crate) struct PhotoHeader {
     pub has_unused_orientation: bool,
 }
 
+/// [`MissingPhoto::reason`] of a file that does not exist.
+pub(crate) const NO_IMAGE: &str = "without an image";
+
 /// A frame without a usable image, by its name in the camera file.
 pub(crate) struct MissingPhoto {
     pub name: String,
-    /// Reason, with the same text for equal cases.
+    /// Reason, with the same text for equal cases; it completes "a frame ..".
     pub reason: String,
 }
 
@@ -73,22 +76,23 @@ pub(crate) struct PhotoScene {
 }
 
 impl Photo {
-    /// Creates a photo. With `undistort`, the image is undistorted on load; otherwise `lens` is ignored.
+    /// Creates a photo. With `undistort`, the image is undistorted on load; otherwise `lens` is ignored. `size` are the columns
+    /// and rows that the camera file gives; without them neither the aspect ratio nor the EXIF orientation is checked.
     pub fn new(
         path: PathBuf,
         c2w: Pose,
         intrinsics_norm: IntrinsicsNorm,
-        lens: Lens,
-        undistort: bool,
+        size: Option<[f64; 2]>,
+        (lens, undistort): (Lens, bool),
     ) -> Result<Self, DataError> {
         intrinsics_norm.validate()?;
-        let time = number_at_end(&path);
+        let (time, shape) = (number_at_end(&path), size.map(|[width, height]| width / height));
         if !undistort || lens.is_pinhole() {
-            return Ok(Self { path, camera: Camera { intrinsics_norm, c2w }, undistortion: None, shape: None, time });
+            return Ok(Self { path, camera: Camera { intrinsics_norm, c2w }, undistortion: None, shape, time });
         }
         let undistortion = Undistortion::new(intrinsics_norm, lens)?;
         let camera = Camera { intrinsics_norm: undistortion.intrinsics_norm(), c2w };
-        Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape: None, time })
+        Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape, time })
     }
 
     pub fn read(&self) -> Result<Vec<u8>, DataError> {

@@ -13,7 +13,7 @@ use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::find_by_name;
 use crate::sources::photos::image_cache::{ImageCache, ImageCacheConfig};
-use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoHeader, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{MissingPhoto, NO_IMAGE, Photo, PhotoHeader, PhotoOptions, PhotoScene};
 use crate::sources::photos::scene_folder::SceneFolder;
 
 /// Largest number of photos in the cache, about 300 bytes each.
@@ -21,7 +21,6 @@ const MAX_CACHED_PHOTOS: usize = 200_000;
 const MAX_CACHED_SCENES: usize = 256;
 /// Largest number of frames named in the report; further frames are counted.
 const MAX_NAMED_FRAMES: usize = 10_000;
-const NO_IMAGE: &str = "without an image";
 
 /// Images that a note counts.
 const COUNTED: [&str; 3] = [

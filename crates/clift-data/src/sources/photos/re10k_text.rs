@@ -7,7 +7,7 @@ use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::geometry::camera::Camera;
 use crate::sources::photos::image_folder::numbered_images;
-use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoScene};
+use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene};
 
 /// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
@@ -51,7 +51,7 @@ fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Strin
                 let (path, time) = (path.clone(), Some(time));
                 scene.photos.push(Photo { path, camera, undistortion: None, shape: None, time });
             }
-            None => scene.skip(time.to_string(), "without an image"),
+            None => scene.skip(time.to_string(), NO_IMAGE),
         }
     }
     // Time stamps increase, so that no image is counted twice.

@@ -25,6 +25,16 @@ pub(crate) enum SceneFiles {
     Re10kText { cameras: PathBuf, frames: PathBuf },
 }
 
+impl SceneFiles {
+    /// Whether a folder with these files is a capture of its own, whatever its name; clips lie in folders of a data set.
+    pub fn is_capture(&self) -> bool {
+        match self {
+            Self::Transforms(_) | Self::Colmap { .. } => true,
+            Self::Re10kText { .. } => false,
+        }
+    }
+}
+
 /// An unread scene on disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SceneFolder {

@@ -41,33 +41,6 @@ pub struct KMeansFit {
     pub iterations: usize,
 }
 
-impl KMeansFit {
-    /// Returns the share of a scene's [`total_variance`] within clusters; 0 for a scene of equal tokens.
-    pub fn error(&self, scene: usize, total_variance: f64) -> f64 {
-        if total_variance > 0.0 { self.inertia[scene] / total_variance } else { 0.0 }
-    }
-}
-
-/// Computes the sum of squared distances of the tokens to their mean, per scene: the inertia of a single cluster.
-///
-/// # Shapes
-/// - `tokens`: `[batch, num_tokens, dim]`
-///
-/// # Errors
-/// [`ModelError::Device`] if the values cannot be read from the device.
-pub fn total_variance(tokens: &Tensor<3>) -> Result<Vec<f64>, ModelError> {
-    let [batch, num_tokens, _] = tokens.dims();
-    let centered = tokens.clone() - tokens.clone().mean_dim(1);
-    // Summed in f64 on the host: squares of thousands of tokens differ in magnitude.
-    let squares = centered.square().sum_dim(2).reshape([batch * num_tokens]); // [B, N, D] -> [B * N]
-    let squares = squares
-        .into_data()
-        .convert::<f32>()
-        .try_to_vec::<f32>()
-        .map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
-    Ok(squares.chunks(num_tokens).map(|scene| scene.iter().copied().map(f64::from).sum()).collect())
-}
-
 impl KMeans {
     /// Groups the tokens of every scene into `num_clusters` clusters, none of them empty. For
     /// `num_clusters = num_tokens` every token is a cluster.
@@ -127,7 +100,7 @@ impl KMeans {
 mod tests {
     use std::collections::BTreeSet;
 
-    use burn::tensor::{Device, TensorData};
+    use burn::tensor::Device;
 
     use super::*;
     use crate::testing::{Fixture, cpu_devices, devices, random, to_vec};
@@ -294,23 +267,5 @@ mod tests {
                 assert_eq!(message, "bad clusters: a token of scene 1 is not finite");
             }
         }
-    }
-
-    #[test]
-    fn error_is_the_share_of_variance_within_clusters() {
-        // Two distant groups of tokens with small noise.
-        let rows: Vec<[f64; 2]> =
-            (0..64).map(|i| [f64::from(i % 2) * 10.0, f64::from(i * 7919 % 101) * 1e-3]).collect();
-        let values: Vec<f32> = rows.iter().flatten().map(|&value| value as f32).collect();
-        let tokens = Tensor::from_data(TensorData::new(values, [1, 64, 2]), &Device::flex());
-        let spread = |rows: &[[f64; 2]]| {
-            let mean = [0, 1].map(|i| rows.iter().map(|row| row[i]).sum::<f64>() / rows.len() as f64);
-            rows.iter().flat_map(|row| [row[0] - mean[0], row[1] - mean[1]]).map(|d| d * d).sum::<f64>()
-        };
-        let (even, odd): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row[0] == 0.0);
-        let expected = (spread(&even) + spread(&odd)) / spread(&rows);
-        let error = |tokens: Tensor<3>| fit(&tokens, 2, &[1]).error(0, total_variance(&tokens).unwrap()[0]);
-        assert!((error(tokens) / expected - 1.0).abs() < 1e-3); // f32
-        assert_eq!(error(Tensor::ones([1, 8, 2], &Device::flex())), 0.0, "equal tokens");
     }
 }

@@ -23,18 +23,19 @@ const MARGIN_CELLS: usize = 4;
 pub enum SelectionPreset {
     /// Algorithm 1 of the paper: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous frame.
     Paper,
-    /// Tokens nearest to any cell, independent of the previous frame: the rules of the render budgets in the released code.
+    /// Tokens nearest to any cell, independent of the previous frame, as the released code selects for its table of render
+    /// budgets.
     Global,
-    /// Algorithm 1 with cells that scale with the image, equal to [`SelectionPreset::Paper`] at 256 pixels: for an image
-    /// of 32 pixels, margins of four 16-pixel cells are four fifths of the grid's width and most tokens would lie outside
-    /// the view. A camera that turns by more than a cell between frames is a cut, which starts without momentum and bonus.
+    /// Algorithm 1 with cells that scale with the image, at 256 pixels those of [`SelectionPreset::Paper`]: for an image of
+    /// 32 pixels, margins of four 16-pixel cells are four fifths of the grid's width and most tokens would lie outside the
+    /// view. A camera that turns by more than a cell between frames is a cut, which starts without momentum and bonus.
     #[default]
     Scaled,
 }
 
 impl SelectionPreset {
     /// All presets.
-    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+    pub const ALL: &[Self] = Self::VARIANTS;
 
     /// Returns the name in configs and on the command line.
     pub fn name(self) -> &'static str {
@@ -44,11 +45,11 @@ impl SelectionPreset {
     /// Returns the rules of the preset.
     pub fn rules(self) -> SelectionRules {
         match self {
-            Self::Paper => SelectionRules::default(),
+            Self::Paper => SelectionRules::PAPER,
             Self::Global => {
-                SelectionRules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..SelectionRules::default() }
+                SelectionRules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..SelectionRules::PAPER }
             }
-            Self::Scaled => SelectionRules { scaled_cells: true, cuts: true, ..SelectionRules::default() },
+            Self::Scaled => SelectionRules { scaled_cells: true, cuts: true, ..SelectionRules::PAPER },
         }
     }
 }
@@ -61,18 +62,18 @@ impl FromStr for SelectionPreset {
     }
 }
 
-/// Distance of tokens to grid cells, tokens per cell, and the size of cells. The default is Algorithm 1 of the paper.
+/// Distance of tokens to grid cells, tokens per cell, and the size of cells.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SelectionRules {
-    /// Weight of the distance between the cameras of token and target, in normalized units, beside the angle between the
-    /// rays of token and cell, in radians.
+    /// The distance of a token to a cell is the angle between their rays, in radians, plus this weight times the distance
+    /// of their cameras, in normalized units.
     pub distance_weight: f32,
     /// Subtracted from the distance of a token selected for the previous frame.
     pub previous_bonus: f32,
     /// Weight of the distances of the previous frame, in `[0, 1)`.
     pub momentum: f32,
-    /// Whether each of the Q cells first selects its `R / Q` nearest tokens, of R in all; the rest are the nearest to any
-    /// cell.
+    /// Whether each of Q cells first selects its `R / Q` nearest tokens; the places left, of R, go to the tokens nearest to
+    /// any cell.
     pub per_cell: bool,
     /// Whether the side of a cell is 1/16 of the shorter side of the image instead of 16 pixels.
     pub scaled_cells: bool,
@@ -81,20 +82,17 @@ pub struct SelectionRules {
     pub cuts: bool,
 }
 
-impl Default for SelectionRules {
-    fn default() -> Self {
-        Self {
-            distance_weight: 0.02,
-            previous_bonus: 0.03,
-            momentum: 0.5,
-            per_cell: true,
-            scaled_cells: false,
-            cuts: false,
-        }
-    }
-}
-
 impl SelectionRules {
+    /// Algorithm 1 of the paper.
+    pub const PAPER: Self = Self {
+        distance_weight: 0.02,
+        previous_bonus: 0.03,
+        momentum: 0.5,
+        per_cell: true,
+        scaled_cells: false,
+        cuts: false,
+    };
+
     fn cell_px(&self, height: usize, width: usize) -> f64 {
         if self.scaled_cells { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
     }

@@ -28,8 +28,8 @@ pub struct Selector {
     field: Vec<Vec<f32>>,
     /// Whether a token was selected for the previous frame; empty before the first frame.
     previous: Vec<bool>,
-    /// Viewing direction of the previous frame.
-    forward: Option<[f64; 3]>,
+    /// Axis of the camera of the last frame.
+    last_axis: Option<[f64; 3]>,
 }
 
 /// Unit directions, one array per coordinate for vectorization.
@@ -69,7 +69,7 @@ impl Selector {
             directions.z.push(z);
         }
         let origins = rays.iter().map(|ray| ray.origin).collect();
-        Ok(Self { rules, origins, directions, grid: [0; 2], field: Vec::new(), previous: Vec::new(), forward: None })
+        Ok(Self { rules, origins, directions, grid: [0; 2], field: Vec::new(), previous: Vec::new(), last_axis: None })
     }
 
     /// Forgets the previous frame.
@@ -77,7 +77,7 @@ impl Selector {
         self.grid = [0; 2];
         self.field.clear();
         self.previous.clear();
-        self.forward = None;
+        self.last_axis = None;
     }
 
     /// Replaces the rules and forgets the previous frame.
@@ -108,7 +108,7 @@ impl Selector {
         if let Some((position, &value)) = values.find(|(_, value)| !value.is_finite()) {
             return Err(ModelError::NotFinite { name: "the target's camera", value: value as f32, position });
         }
-        self.detect_cut(&cells, self.rules.grid(height, width));
+        self.start_frame(camera, &cells, self.rules.grid(height, width));
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
@@ -121,16 +121,15 @@ impl Selector {
         Ok(chosen)
     }
 
-    /// Forgets the previous frame if the camera turned by more than the angle of the central cell.
-    fn detect_cut(&mut self, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
-        let middle = rows / 2 * columns + columns / 2;
-        let forward = cells[middle];
+    /// Forgets the previous frame after a cut: if the camera turned by more than the angle of the central cell.
+    fn start_frame(&mut self, camera: &ViewCamera, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
         let angle = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().clamp(-1.0, 1.0).acos();
-        if self.rules.cuts && self.forward.is_some_and(|last| angle(last, forward) > angle(forward, cells[middle - 1]))
-        {
+        let (axis, middle) = (camera.axis(), rows / 2 * columns + columns / 2);
+        let cell = angle(cells[middle], cells[middle - 1]);
+        if self.rules.cuts && self.last_axis.is_some_and(|last| angle(last, axis) > cell) {
             self.reset();
         }
-        self.forward = Some(forward);
+        self.last_axis = Some(axis);
     }
 
     /// Updates the smoothed distances of all tokens to all cells and returns the nearest tokens.

@@ -59,12 +59,13 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         let Some((intrinsics_norm, lens)) = optics.get(&image.camera_id) else {
             return Err(in_frame(DataError::BadCamera { what: format!("no camera {}", image.camera_id) }));
         };
+        let camera = &cameras[&image.camera_id];
+        let size = Some([camera.width as f64, camera.height as f64]);
         let photo = image
             .c2w()
-            .and_then(|c2w| Photo::new(path, c2w, *intrinsics_norm, *lens, options.undistort))
+            .and_then(|c2w| Photo::new(path, c2w, *intrinsics_norm, size, (*lens, options.undistort)))
             .map_err(in_frame)?;
-        let camera = &cameras[&image.camera_id];
-        scene.photos.push(Photo { shape: Some(camera.width as f64 / camera.height as f64), ..photo });
+        scene.photos.push(photo);
     }
     scene.num_without_camera = folders.num_unrequested();
     Ok(scene)

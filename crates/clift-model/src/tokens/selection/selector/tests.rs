@@ -32,7 +32,7 @@ struct BruteForce {
     rules: SelectionRules,
     rays: Vec<TokenRay>,
     frames: Vec<(Vec<Vec<f64>>, Vec<usize>)>,
-    forward: Option<[f64; 3]>,
+    last_axis: Option<[f64; 3]>,
     grid: [usize; 2],
 }
 
@@ -48,13 +48,13 @@ impl BruteForce {
                 camera.direction(pixel(cell % columns), pixel(cell / columns))
             })
             .collect();
-        // The third column of the pose: where the camera looks.
-        let forward = [2, 6, 10].map(|i| camera.c2w[i]);
-        let turned = self.forward.map(|last| last.iter().zip(forward).map(|(a, b)| a * b).sum::<f64>().min(1.0).acos());
+        let axis = camera.axis();
+        let turned =
+            self.last_axis.map(|last: [f64; 3]| last.iter().zip(axis).map(|(a, b)| a * b).sum::<f64>().min(1.0).acos());
         if rules.cuts && turned.is_some_and(|turned| turned > (side / camera.intrinsics[0]).atan()) {
             self.frames.clear();
         }
-        self.forward = Some(forward);
+        self.last_axis = Some(axis);
         let unit = |v: [f64; 3]| v.map(|x| x / v.iter().map(|x| x * x).sum::<f64>().sqrt());
         let mut field = vec![vec![0.0; self.rays.len()]; cells.len()];
         for (q, cell) in cells.iter().enumerate() {
@@ -111,16 +111,16 @@ fn angle_equals_acos() {
 fn frames_equal_brute_force_for_0_to_7_tokens_per_cell() {
     // A grid of (2 + 8) x (1 + 8) = 90 cells: n is 0, 0, 1, 3, 5, 6 and 7.
     let (height, width) = (32, 16);
-    assert_eq!(SelectionRules::default().grid(height, width), [10, 9]);
+    assert_eq!(SelectionRules::PAPER.grid(height, width), [10, 9]);
     let rays = random_rays(700, 1);
-    for preset in SelectionPreset::ALL {
+    for &preset in SelectionPreset::ALL {
         for count in [1, 89, 90, 350, 470, 600, 699, 700] {
             let mut selector = Selector::new(preset.rules(), &rays).unwrap();
             let mut expected = BruteForce {
                 rules: preset.rules(),
                 rays: rays.clone(),
                 frames: Vec::new(),
-                forward: None,
+                last_axis: None,
                 grid: [0; 2],
             };
             // A slow turn, a turn that is a cut for `scaled`, whose cells span 1 / 60, a slow turn, and another grid of
@@ -139,7 +139,7 @@ fn frames_equal_brute_force_for_0_to_7_tokens_per_cell() {
 #[test]
 fn ties_go_to_the_lower_ids() {
     let ray = TokenRay { origin: [0.1, 0.2, 0.3], direction: [0.0, 0.1, 1.0] };
-    for preset in SelectionPreset::ALL {
+    for &preset in SelectionPreset::ALL {
         let mut selector = Selector::new(preset.rules(), &[ray; 300]).unwrap();
         for count in [1, 7, 81, 170, 299] {
             selector.reset();
@@ -161,14 +161,14 @@ fn camera_distance_has_weight_one_fiftieth() {
 #[test]
 fn zero_tokens_and_non_finite_inputs_are_refused() {
     let rays = random_rays(3, 4);
-    let mut selector = Selector::new(SelectionRules::default(), &rays).unwrap();
+    let mut selector = Selector::new(SelectionRules::PAPER, &rays).unwrap();
     let message = selector.select(&camera([0.0; 3], 0.0), 16, 16, 0).unwrap_err().to_string();
     assert_eq!(message, "`num_render_tokens` = 0: write at least 1");
     let message = selector.select(&camera([f64::NAN, 0.0, 0.0], 0.0), 16, 16, 1).unwrap_err().to_string();
     assert!(message.starts_with("the target's camera holds NaN"), "{message}");
     for direction in [[0.0; 3], [f64::NAN, 0.0, 1.0], [f64::INFINITY, 0.0, 1.0]] {
         let rays = [rays[0], TokenRay { direction, ..rays[1] }];
-        let message = Selector::new(SelectionRules::default(), &rays).unwrap_err().to_string();
+        let message = Selector::new(SelectionRules::PAPER, &rays).unwrap_err().to_string();
         assert!(message.starts_with("invalid ray of token 1"), "{message}");
     }
     assert_eq!("global".parse::<SelectionPreset>().unwrap(), SelectionPreset::Global);
@@ -184,7 +184,7 @@ proptest! {
     #[test]
     fn every_frame_has_the_requested_number_of_distinct_tokens(
         num_tokens in 1_usize..400, counts in prop::collection::vec(1_usize..500, 1..5), seed in 0_u64..1000,
-        height in 1_usize..40, width in 1_usize..40, preset in 0_usize..3,
+        height in 1_usize..40, width in 1_usize..40, preset in 0..SelectionPreset::ALL.len(),
     ) {
         let mut selector = Selector::new(SelectionPreset::ALL[preset].rules(), &random_rays(num_tokens, seed)).unwrap();
         for (frame, count) in counts.into_iter().enumerate() {
