@@ -34,7 +34,7 @@ pub struct ModelConfig {
     /// How attention knows the cameras.
     #[serde(skip_serializing_if = "is_default")]
     pub camera_encoding: CameraEncoding,
-    /// Number of renderings, with patches shifted by half a patch, whose mean is an image: 1, 2 or 4. Training renders an
+    /// Number of renderings, with patches shifted along the diagonal, whose mean is an image: 1, 2 or 4. Training renders an
     /// image once.
     #[serde(skip_serializing_if = "is_default")]
     pub patch_grids: PatchGrids,
@@ -162,7 +162,7 @@ impl ModelConfig {
     /// As [`num_patches`](Self::num_patches).
     pub(crate) fn drawn_patches(&self, height: usize, width: usize) -> Result<Vec<usize>, ModelError> {
         self.num_patches(1, height, width)?;
-        let patches = self.patch_grids.patches([height, width].map(|side| side / self.patch_size));
+        let patches = self.patch_grids.patches(self.patch_size, [height, width].map(|side| side / self.patch_size));
         Ok(patches.map(|[rows, columns]| rows * columns).collect())
     }
 
@@ -381,7 +381,7 @@ mod tests {
         let gta = r#"{"camera_encoding": "gta", "patch_grids": 4}"#;
         let config = parse(gta).expect("a model section");
         config.validate().expect("valid");
-        assert_eq!(config.drawn_patches(16, 24).expect("divides"), [6, 8, 9, 12]);
+        assert_eq!(config.drawn_patches(16, 24).expect("divides"), [6, 12, 12, 12]);
         let prope = parse(&gta.replace("gta", "prope")).expect("a model section").validate().unwrap_err().to_string();
         assert!(prope.starts_with("`model.patch_grids` = 4: model.camera_encoding = \"prope\""), "{prope}");
         let three = parse(&gta.replace('4', "3")).unwrap_err().to_string();

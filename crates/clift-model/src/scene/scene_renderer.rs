@@ -21,7 +21,7 @@ use crate::views::interleave::{interleaved, parts};
 use crate::views::patch_grids::PatchGrids;
 use crate::views::upload::Cameras;
 use crate::weights::hash::{renderer_hash, weights_hash};
-use crate::weights::model_path::check_heads;
+use crate::weights::model_path::check_sizes;
 use crate::weights::trained_model::open_renderer;
 
 /// Most frames of one call with all tokens, where frames share keys and values.
@@ -37,7 +37,7 @@ pub fn frames_per_call(num_patches: usize) -> usize {
 /// Returns the peak bytes of tensors, without weights, while one call renders frames of a scene with the network `model`.
 pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [height, width]: [usize; 2]) -> u64 {
     let (k, size) = parts(scene.height, model.patch_size, [height, width]);
-    let grids = model.patch_grids.patches(size.map(|side| side / model.patch_size));
+    let grids = model.patch_grids.patches(model.patch_size, size.map(|side| side / model.patch_size));
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
     let num_images = k * k * num_frames;
     render_bytes(model, scene.num_tokens(), num_images, num_images * largest)
@@ -54,7 +54,7 @@ pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<R
     let is_former = got != scene.renderer_hash && weights_hash(&renderer) == scene.renderer_hash;
     if is_former {
         // The hash of a scene file of version 1 does not include the heads.
-        weights.ancestors().skip(1).take(2).try_for_each(|dir| check_heads(&scene.model, dir))?;
+        weights.ancestors().skip(1).take(2).try_for_each(|dir| check_sizes(&scene.model, dir))?;
     } else if got != scene.renderer_hash {
         return Err(ModelError::OtherRenderer { expected: scene.renderer_hash.clone(), got, path: weights.into() });
     }

@@ -1,8 +1,9 @@
 //! Images averaged over shifted grids of patches ("cycle spinning", Coifman and Donoho 1995).
 //!
-//! The last layer makes the pixels of a patch from the token of that patch alone, which leaves seams between patches. An image
-//! that is rendered again with its patches elsewhere has its seams elsewhere. In the mean, weighted by the distance from the
-//! seams, they are faint.
+//! The last layer makes the pixels of a patch from the token of that patch alone, which leaves seams between patches, and a
+//! pattern inside them where a network knows little. An image that is rendered again with its patches elsewhere has both
+//! elsewhere. With shifts along the diagonal every row and every column of a patch comes to lie on each other one: what repeats
+//! along rows or columns of all patches cancels in the mean.
 // B scenes, V views, H rows, W columns
 
 use burn::tensor::{Tensor, TensorData};
@@ -20,13 +21,17 @@ pub enum PatchGrids {
     One,
     /// Two grids, half a patch apart along the diagonal.
     Two,
-    /// Four grids, shifted by half a patch along rows, columns and both.
+    /// Four grids, a quarter of a patch apart along the diagonal.
     Four,
 }
 
 impl From<PatchGrids> for usize {
     fn from(grids: PatchGrids) -> Self {
-        grids.half_shifts().len()
+        match grids {
+            PatchGrids::One => 1,
+            PatchGrids::Two => 2,
+            PatchGrids::Four => 4,
+        }
     }
 }
 
@@ -50,71 +55,44 @@ impl std::str::FromStr for PatchGrids {
 }
 
 impl PatchGrids {
-    /// Whether each grid is shifted by half a patch, by row and by column.
-    const fn half_shifts(self) -> &'static [[usize; 2]] {
-        match self {
-            Self::One => &[[0, 0]],
-            Self::Two => &[[0, 0], [1, 1]],
-            Self::Four => &[[0, 0], [0, 1], [1, 0], [1, 1]],
-        }
+    /// Returns the shift of every grid in pixels, both down and right; a patch of fewer pixels than grids has fewer shifts.
+    fn shifts(self, patch_size: usize) -> Vec<usize> {
+        let count = usize::from(self);
+        let mut shifts: Vec<usize> = (0..count).map(|grid| grid * patch_size / count).collect();
+        shifts.dedup();
+        shifts
     }
 
-    /// Returns the number of patches of every grid of an image, `[rows, columns]`: a shifted grid has one more.
-    pub(crate) fn patches(self, [rows, columns]: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
-        self.half_shifts().iter().map(move |[down, right]| [rows + down, columns + right])
+    /// Returns the number of patches of every grid of an image, `[rows, columns]`: a shifted grid has one more of both.
+    pub(crate) fn patches(self, patch_size: usize, patches: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
+        let grown = move |shift: usize| patches.map(|side| side + usize::from(shift > 0));
+        self.shifts(patch_size).into_iter().map(grown)
     }
 
-    /// Returns the mean of the images that `draw` returns for every grid. A pixel of an image counts by its distance from
-    /// the sides of its patch.
+    /// Returns the mean of the images that `draw` returns for every grid.
     ///
     /// # Shapes
     /// - `draw`: of cameras of any size, `[batch, views, height, width, 3]`
     /// - returns `[batch, views, height, width, 3]` of the size of `targets`
     pub(crate) fn mean(self, patch_size: usize, targets: &Cameras, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
-        let shifts: Vec<[usize; 2]> =
-            self.half_shifts().iter().map(|halves| halves.map(|half| half * (patch_size / 2))).collect();
-        let [first, rest @ ..] = &shifts[..] else { unreachable!("every variant has a grid") };
-        if rest.is_empty() || patch_size == 1 {
-            return draw(targets);
-        }
-        let size = [targets.height, targets.width];
-        let mut sums = vec![0.0; size[0] * size[1]];
-        for &shift in &shifts {
-            sums.iter_mut().zip(distances(size, patch_size, shift)).for_each(|(sum, distance)| *sum += distance);
-        }
-        let weighted = |&shift: &[usize; 2]| {
-            let weights: Vec<f64> = distances(size, patch_size, shift).zip(&sums).map(|(d, sum)| d / sum).collect();
-            let image = shifted(patch_size, targets, shift, &draw);
-            let options = (&image.device(), image.dtype());
-            image * Tensor::from_data(TensorData::new(weights, [1, 1, size[0], size[1], 1]), options)
-        };
-        rest.iter().fold(weighted(first), |sum, shift| sum + weighted(shift))
+        let shifts = self.shifts(patch_size);
+        let shifted = shifts[1..].iter().map(|&shift| shifted(patch_size, targets, shift, &draw));
+        let sum = shifted.fold(draw(targets), |sum, image| sum + image);
+        if shifts.len() == 1 { sum } else { sum / shifts.len() as f64 }
     }
 }
 
 /// Draws an image on a grid whose first patch begins `shift` pixels above and left of it.
-fn shifted(patch_size: usize, targets: &Cameras, shift: [usize; 2], draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
-    let [down, right] = shift;
-    let grown = |side: usize, shift: usize| side + if shift > 0 { patch_size } else { 0 };
+fn shifted(patch_size: usize, targets: &Cameras, shift: usize, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
     let options = (&targets.intrinsics.device(), targets.intrinsics.dtype());
-    let moved = Tensor::from_data(TensorData::new(vec![0.0, 0.0, right as f64, down as f64], [1, 1, 4]), options);
+    let moved = Tensor::from_data(TensorData::new(vec![0.0, 0.0, shift as f64, shift as f64], [1, 1, 4]), options);
     let cameras = Cameras {
-        height: grown(targets.height, down),
-        width: grown(targets.width, right),
+        height: targets.height + patch_size,
+        width: targets.width + patch_size,
         c2w: targets.c2w.clone(),
         intrinsics: targets.intrinsics.clone() + moved,
     };
-    draw(&cameras).narrow(2, down, targets.height).narrow(3, right, targets.width)
-}
-
-/// Returns the distance of every pixel's center from the sides of its patch: the product of those along row and column.
-fn distances(size: [usize; 2], patch_size: usize, [down, right]: [usize; 2]) -> impl Iterator<Item = f64> {
-    let distance = move |pixel: usize| {
-        let inside = (pixel % patch_size) as f64 + 0.5;
-        inside.min(patch_size as f64 - inside)
-    };
-    let [height, width] = size;
-    (0..height).flat_map(move |y| (0..width).map(move |x| distance(y + down) * distance(x + right)))
+    draw(&cameras).narrow(2, shift, targets.height).narrow(3, shift, targets.width)
 }
 
 #[cfg(test)]
@@ -145,27 +123,38 @@ mod tests {
         }
     }
 
-    #[test]
-    fn seams_between_patches_are_fainter() {
+    /// Returns the red values of an image whose pixels depend on row and column alone, as drawn on every grid.
+    fn red(grids: PatchGrids, value: fn(usize, usize) -> f32) -> Vec<f64> {
         let device = Device::flex();
-        // A chessboard of patches: the largest jump between neighbours of a row is at a seam.
         let draw = |cameras: &Cameras| {
             let [height, width] = [cameras.height, cameras.width];
-            let pixel = |i: usize| ((i / width / 4 + i % width / 4) % 2) as f32;
-            let pixels: Vec<f32> = (0..height * width).map(pixel).collect();
-            Tensor::<1>::from_floats(pixels.as_slice(), &device)
-                .reshape([1, 1, height, width, 1])
-                .expand([2, 3, height, width, 3])
+            let pixels: Vec<f32> = (0..height * width).map(|i| value(i / width, i % width)).collect();
+            let image = Tensor::<1>::from_floats(pixels.as_slice(), &device).reshape([1, 1, height, width, 1]);
+            image.expand([2, 3, height, width, 3])
         };
+        to_vec(grids.mean(4, &cameras(&device), draw)).into_iter().step_by(3).collect()
+    }
+
+    #[test]
+    fn seams_between_patches_are_fainter() {
+        // A chessboard of patches: the largest jump between neighbours of a row is at a seam.
         let jump = |grids: PatchGrids| {
-            let red: Vec<f64> = to_vec(grids.mean(4, &cameras(&device), draw)).into_iter().step_by(3).collect();
+            let red = red(grids, |row, column| ((row / 4 + column / 4) % 2) as f32);
             let jumps = red.chunks(20).flat_map(|row| row.windows(2).map(|pair| (pair[0] - pair[1]).abs()));
             jumps.fold(0.0, f64::max)
         };
-        assert_eq!(jump(PatchGrids::One), 1.0);
-        // Halved in this worst case, and spread over four pixels.
-        for grids in [PatchGrids::Two, PatchGrids::Four] {
-            assert!((jump(grids) - 0.5).abs() < 1e-6, "{grids:?}: {}", jump(grids));
+        for grids in [PatchGrids::One, PatchGrids::Two, PatchGrids::Four] {
+            assert!((jump(grids) - 1.0 / usize::from(grids) as f64).abs() < 1e-6, "{grids:?}: {}", jump(grids));
+        }
+    }
+
+    #[test]
+    fn patterns_along_rows_and_columns_cancel() {
+        const LINE: [f32; 4] = [0.1, 0.9, 0.4, 0.2];
+        let mean = f64::from(LINE.iter().sum::<f32>()) / 4.0;
+        for value in [|row: usize, _: usize| LINE[row % 4], |_: usize, column: usize| LINE[column % 4]] {
+            assert!(red(PatchGrids::Four, value).iter().all(|red| (red - mean).abs() < 1e-6));
+            assert!(red(PatchGrids::One, value).iter().any(|red| (red - mean).abs() > 0.1));
         }
     }
 
@@ -175,11 +164,12 @@ mod tests {
         for (count, grids) in [(1, PatchGrids::One), (2, PatchGrids::Two), (4, PatchGrids::Four)] {
             assert_eq!((parse(&count.to_string()), usize::from(grids)), (Ok(grids), count));
             assert_eq!(count.to_string().parse(), Ok(grids));
-            assert_eq!(grids.patches([3, 5]).count(), count);
+            assert_eq!(grids.patches(8, [3, 5]).count(), count);
         }
         assert!(parse("3").unwrap_err().contains("write 1, 2 or 4"), "{:?}", parse("3"));
         assert!("0".parse::<PatchGrids>().is_err());
-        let patches: Vec<_> = PatchGrids::Four.patches([3, 5]).collect();
-        assert_eq!(patches, [[3, 5], [3, 6], [4, 5], [4, 6]]);
+        assert_eq!([4, 2, 1].map(|size| PatchGrids::Four.shifts(size)), [vec![0, 1, 2, 3], vec![0, 1], vec![0]]);
+        let patches: Vec<_> = PatchGrids::Two.patches(4, [3, 5]).collect();
+        assert_eq!(patches, [[3, 5], [4, 6]]);
     }
 }
