@@ -40,7 +40,7 @@ pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, D
 fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<OpenedSource, DataError> {
     let missing = |key: &str, fix: &str| DataError::bad_config(key, format!("is missing; {fix}"));
     let root = config.root.as_deref();
-    let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
+    let root = root.ok_or_else(|| missing("data.root", "write the folder of the data set or capture"))?;
     let (filters, files) = (config.filters.clone(), config.files.clone());
     let options = SourceOptions {
         kind,

@@ -164,8 +164,14 @@ pub enum DataError {
     },
     /// The camera centres that define a scene's scale coincide.
     #[error(
-        "scene {key} has no baseline: its {num_views} camera centres lie within {extent:.3e} of their mean, \
-         below the resolution of f32 files, {threshold:.3e}; remove the scene or choose other frames"
+        "scene {key} has no baseline: {}; remove the scene or choose other frames",
+        match num_views {
+            1 => "it has one view, and at least two are needed".to_owned(),
+            _ => format!(
+                "its {num_views} camera centres lie within {extent:.3e} of their mean, below the resolution of f32 files, \
+                 {threshold:.3e}"
+            ),
+        }
     )]
     ZeroBaseline {
         /// Scene key.

@@ -37,7 +37,12 @@ pub fn fit_token_codec(
         let fix = "the token codec is one of K-means tokens; tokens of other groups are stored in f32, f16 or int8";
         return Err(bad("clusters.grouping", format!("\"{grouping}\""), fix));
     }
-    let eval = EvalConfig { index: None, num_scenes: 0, ..config.eval.clone() };
+    let source = &reader.source;
+    let longest = (0..source.num_scenes()).filter_map(|scene| source.num_frames(scene).ok()).max();
+    // A capture of few photos has fewer targets.
+    let most_targets = longest.unwrap_or_default().saturating_sub(config.eval.num_context);
+    let num_targets = config.eval.num_targets.min(most_targets.max(1));
+    let eval = EvalConfig { index: None, num_scenes: 0, num_targets, ..config.eval.clone() };
     let (items, ..) = evaluation_items(&eval, reader, frames)?;
     let options = CodecOptions {
         counts: eval.storage,

@@ -33,7 +33,7 @@ fn captures_train_and_render_and_name_missing_frames() {
         finish(start(&mut command))
     };
     with_model("run").ok().prints("scene attic, 2 views of 16 x 16").notes("model: ");
-    with_model("none").fails_with(2, &["no trained model at "]);
+    with_model("none").fails_with(2, &["/none: no such file or folder"]);
 }
 
 #[test]

@@ -214,7 +214,7 @@ fn runs_start_from_weights_of_other_runs() {
     }
 
     let set = [&format!("stage1.init_from={first:?}"), "model.dim=8"];
-    place.train("third --only stage1", &set).fails_with(1, &[&file]);
+    place.train("third --only stage1", &set).fails_with(2, &["`model.dim` = 8", "a network with 16; "]);
     place.train("fourth", &["stage1.init_from=no/such/run.safetensors"]).fails_with(1, &["no/such/run.safetensors"]);
 
     // The condenser of a run's stage 2; without one, before stage 1 is trained.

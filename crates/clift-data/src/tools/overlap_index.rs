@@ -57,7 +57,8 @@ impl OverlapOptions {
             format!("is {num_context}; use 2 or more")
         })?;
         let least = num_context - usize::from(self.context_targets);
-        check_config(near >= least && far >= near, "distance", || {
+        check_config(far >= near, "distance", || format!("is {near} to {far}; write the smaller number first"))?;
+        check_config(near >= least, "distance", || {
             format!("is {near} to {far}; {num_context} contexts and a target need a gap of {least} or more")
         })?;
         let (most, frames) = if self.context_targets {

@@ -109,7 +109,7 @@ fn colmap_images_are_found_from_any_model_folder() {
     let scene = root.path().join("attic");
     copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));
     let report = open_test(root.path()).unwrap().report;
-    assert!(report.notes[0].ends_with("sparse/0 has 1 more models; only model 0 is used"), "{report}");
+    assert!(report.notes[0].ends_with("sparse has 1 more model; only model 0 is used"), "{report}");
     let models: [(&str, PathBuf); 3] =
         [("colmap/sparse/0", "images".into()), ("dense/sparse", "dense/images".into()), ("sparse", "images_4".into())];
     for (model, images) in models {

@@ -67,6 +67,11 @@ impl Evaluator {
         Ok(Self { eval, sweep, description, reader, items, split, skip_report, device: device.clone() })
     }
 
+    /// Returns the keys of the measured scenes.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.items.iter().map(|item| self.reader.source.key(item.scene))
+    }
+
     /// Returns what is measured: scenes, targets and split, then warnings about figures that mislead.
     pub fn describe(&self) -> (String, Vec<String>) {
         let num_targets: usize = self.items.iter().map(|item| item.views.target.len()).sum();
@@ -120,7 +125,9 @@ impl Evaluator {
         }
         let summary = Summary::new(&measured);
         if summary.num_views == 0 {
-            return Err(EvalError::NoScenes { reason: "every scene of the evaluation failed".into() });
+            let first = skipped.skips.first().map(|skip| format!(", first {}: {}", skip.key, skip.reason));
+            let reason = format!("every scene of the evaluation failed{}", first.unwrap_or_default());
+            return Err(EvalError::NoScenes { reason });
         }
         for external in external_methods {
             self.require_images(external, &summary)?;

@@ -32,7 +32,9 @@ pub fn evaluation_items(
         for scene in 0..count {
             match source.num_frames(scene).map(|count| frames.views(count, eval.num_context, eval.num_targets)) {
                 Ok(Some(views)) => items.push(EvaluationItem { scene, views }),
-                Ok(None) => skip_report.skip(source.key(scene), "too few frames for its views"),
+                Ok(None) => {
+                    skip_report.skip(source.key(scene), "too few frames for eval.num_context and eval.num_targets");
+                }
                 Err(error) => skip_report.skip(source.key(scene), error.to_string()),
             }
         }

@@ -119,7 +119,7 @@ impl Report {
                     @if first != last { " and " (psnr_at(last)) }
                     "."
                     @if let Some(gain) = last.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
-                        " The latter is " (grouped(gain.abs(), 2)) " dB "
+                        (if first == last { " This is " } else { " The latter is " }) (grouped(gain.abs(), 2)) " dB "
                         (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view"
                         @if baselines.nearest_view.num_identical_views > 0 {
                             ", which is the target itself for " (count(baselines.nearest_view.num_identical_views))

@@ -96,20 +96,32 @@ pub fn refuse_checkpoint(path: &Path) -> Result<(), ModelError> {
     Ok(())
 }
 
-/// Checks that a network has the number of heads in the config of its weights' directory, if there is one. Tensor shapes do
-/// not determine the number of heads; a wrong number would silently change the output.
+/// Checks that encoder and renderer of a network have the sizes in the config of its weights' directory, if there is one.
+/// Tensor shapes do not determine heads and camera encoding, and a file may have more blocks than are read: another value
+/// would silently change the output.
 ///
 /// # Errors
-/// [`ModelError::BadConfig`] for other heads, [`ModelError::BadConfigFile`] for a config that cannot be read.
-pub fn check_heads(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
-    let Some(ModelConfig { num_heads, .. }) = read_config(dir)? else { return Ok(()) };
-    if model.num_heads != num_heads {
-        let path = dir.join("config.toml");
-        let fix =
-            format!("the weights belong to a network with {num_heads} heads; write {num_heads}: {}", path.display());
-        return Err(ModelError::BadConfig { key: "model.num_heads", value: model.num_heads.to_string(), fix });
-    }
-    Ok(())
+/// [`ModelError::BadConfig`] with the first other size, [`ModelError::BadConfigFile`] for a config that cannot be read.
+pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
+    let Some(found) = read_config(dir)? else { return Ok(()) };
+    let sizes = |config: &ModelConfig| {
+        [
+            ("model.num_heads", config.num_heads.to_string()),
+            ("model.architecture", config.architecture.to_string()),
+            ("model.camera_encoding", config.camera_encoding.to_string()),
+            ("model.patch_size", config.patch_size.to_string()),
+            ("model.dim", config.dim.to_string()),
+            ("model.feed_forward_dim", config.feed_forward_dim.to_string()),
+            ("model.num_encoder_blocks", config.num_encoder_blocks.to_string()),
+            ("model.num_renderer_blocks", config.num_renderer_blocks.to_string()),
+            ("model.num_latents", config.num_latents.to_string()),
+        ]
+    };
+    let mut pairs = sizes(model).into_iter().zip(sizes(&found));
+    let Some(((key, value), (_, of_weights))) = pairs.find(|(own, other)| own != other) else { return Ok(()) };
+    let path = dir.join("config.toml");
+    let fix = format!("the weights are of a network with {of_weights}; write the same: {}", path.display());
+    Err(ModelError::BadConfig { key, value, fix })
 }
 
 fn read_config(dir: &Path) -> Result<Option<ModelConfig>, ModelError> {
@@ -174,17 +186,21 @@ mod tests {
     }
 
     #[test]
-    fn heads_must_equal_those_of_the_config() {
+    fn sizes_must_equal_those_of_the_config() {
         let folder = tempfile::tempdir().unwrap();
         let check = |text: &str, num_heads| {
             std::fs::write(folder.path().join("config.toml"), text).unwrap();
             let model = ModelConfig { num_heads, ..ModelConfig::default() };
-            check_heads(&model, folder.path()).map_err(|error| error.to_string())
+            check_sizes(&model, folder.path()).map_err(|error| error.to_string())
         };
         assert_eq!(check("[model]\nnum_heads = 4\n[data]\nof_a_later_version = 1", 4), Ok(()));
         assert_eq!(check("seed = 3", 8), Ok(()), "the default");
-        check_heads(&ModelConfig::default(), &folder.path().join("none")).unwrap();
+        check_sizes(&ModelConfig::default(), &folder.path().join("none")).unwrap();
         let message = check("[model]\nnum_heads = 4", 8).unwrap_err();
-        assert!(message.contains("`model.num_heads` = 8: ") && message.contains("with 4 heads"), "{message}");
+        assert!(message.contains("`model.num_heads` = 8: ") && message.contains("a network with 4; "), "{message}");
+        let message = check("[model]\nnum_encoder_blocks = 7", 8).unwrap_err();
+        assert!(message.contains("`model.num_encoder_blocks` = 6: "), "{message}");
+        assert!(check("[model]\ncamera_encoding = \"gta\"", 8).unwrap_err().contains("a network with gta; "));
+        assert_eq!(check("[model.condenser]\nresidual = false", 8), Ok(()), "stage 2 may have another condenser");
     }
 }

@@ -14,7 +14,7 @@ use crate::network::init::Init;
 use crate::network::renderer::Renderer;
 use crate::weights::file::{load_module, load_part};
 use crate::weights::hash::{renderer_hash, weights_hash};
-use crate::weights::model_path::{ModelPath, check_heads};
+use crate::weights::model_path::{ModelPath, check_sizes};
 
 /// A network with trained weights, on a device without autodiff.
 #[derive(Clone, Debug)]
@@ -36,7 +36,7 @@ impl TrainedModel {
     /// [`ModelError::BadConfig`] if the number of heads differs from the config of the weights' directory,
     /// [`ModelError::Weights`] for a file that cannot be read or has other names or shapes.
     pub fn open(path: &ModelPath, config: &ModelConfig, device: &Device) -> Result<Self, ModelError> {
-        check_heads(config, &path.dir)?;
+        check_sizes(config, &path.dir)?;
         let mut network = Clift::new(config, 0, device);
         let mut loaded = load_part(&mut network, &PathFilter::all(), &path.weights)?;
         let has_condenser = loaded.applied.iter().any(|name| is_condenser(name));

@@ -130,10 +130,14 @@ fn validate_data(data: &DataConfig) -> Result<(), TrainError> {
     in_range("data.num_threads", data.num_threads, 0, 1024)?;
     in_range("data.num_prefetch", data.num_prefetch, 1, 1024)?;
     if data.source == SourceKind::Synthetic {
+        if let Some(root) = data.root.as_ref().filter(|root| !root.as_os_str().is_empty()) {
+            let fix = "synthetic scenes are read from no folder: write data.source = \"auto\", or remove the key";
+            return Err(bad("data.root", root.display(), fix));
+        }
         return validate_synthetic(data);
     }
     if data.root.is_none() {
-        return Err(bad("data.root", "missing", "write the folder with train/ and test/"));
+        return Err(bad("data.root", "missing", "write the folder of the data set or capture"));
     }
     data.image_cache.validate().map_err(in_section("data.image_cache"))?;
     data.filters.validate().map_err(in_section("data.filters"))

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_model::{Clift, ModelPath, check_heads, load_part, refuse_checkpoint};
+use clift_model::{Clift, ModelPath, check_sizes, load_part, refuse_checkpoint};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
@@ -28,9 +28,9 @@ pub(crate) fn init_from(
     let [run, _] = &in_folder;
     let path: &Path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     refuse_checkpoint(path)?;
-    // The number of heads of a weight file without a config is unknown.
+    // The sizes of a weight file without a config are unknown.
     if let Ok(found) = ModelPath::find(path) {
-        check_heads(&config.model, &found.dir)?;
+        check_sizes(&config.model, &found.dir)?;
     }
     let mut loaded = load_part(&mut model, &part, path)?;
     if loaded.applied.is_empty() {

@@ -7,10 +7,12 @@ use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::{ClipReader, OpenedSource, SceneSource, SceneSubset, Split, open_dataset, open_training_dataset};
+use clift_data::{
+    ClipReader, OpenedSource, SceneSource, SceneSubset, SourceKind, Split, open_dataset, open_training_dataset,
+};
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
-    Clift, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
+    Clift, ModelPath, TokenCodec, TrainedModel, check_sizes, load_part, save_part, save_weights, weights_hash,
 };
 
 use crate::cluster_cache::builder::ClusterBuilder;
@@ -113,7 +115,7 @@ impl Run {
         config.data.hold_out = trained.hold_out;
         let is_training_data = trained.is_of(&config);
         config.validate()?;
-        check_heads(&config.model, &config.run_dir)?;
+        check_sizes(&config.model, &config.run_dir)?;
         let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
         Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None, ranks: Ranks::single().into() })
@@ -146,8 +148,12 @@ impl Run {
         }
         self.report_opening(Split::Train, sink);
         let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
+        let is_divided = opened.kind != SourceKind::Synthetic && !opened.shares_scenes && self.overfit.is_none();
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
+        if is_divided && let Some(warning) = validation.warn_of_training_scenes(reader.source.as_ref()) {
+            sink.event(&Event::Warning(warning));
+        }
         let train_stage2 = wanted(Stage::Stage2) && !has_stage2;
         if train_stage2 && !self.folder("stage2").join("checkpoints").exists() {
             // A wrong `stage2.init_from` is found before stage 1 takes its time.

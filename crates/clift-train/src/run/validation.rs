@@ -1,11 +1,12 @@
 //! Validation during training, and evaluation after it.
 
+use std::collections::HashSet;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, Split};
+use clift_data::{ClipReader, SceneSource, Split, plural};
 use clift_eval::{
     EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, RunDescription, SceneFigures,
     SceneLimits, Summary, Sweep,
@@ -69,6 +70,17 @@ impl<'a> Validation<'a> {
             sink.event(&Event::Warning(warning));
         }
         Ok(Self { config, evaluator })
+    }
+
+    /// Returns a warning that names evaluated scenes with the keys of training scenes, if there are some.
+    pub fn warn_of_training_scenes(&self, training: &dyn SceneSource) -> Option<String> {
+        let keys: HashSet<&str> = (0..training.num_scenes()).map(|scene| training.key(scene)).collect();
+        let shared: Vec<&str> = self.evaluator.keys().filter(|key| keys.contains(key)).collect();
+        let first = shared.first()?;
+        Some(format!(
+            "{} of the evaluation have the keys of training scenes, such as {first}: the results are not of held-out scenes",
+            plural(shared.len(), "scene"),
+        ))
     }
 
     /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with

@@ -76,14 +76,21 @@ export class Controls {
     event.preventDefault();
     if (!this.view.camera) return;
     const lines = event.deltaMode === 1 ? 16 : 1;
-    const forward = -Math.max(-100, Math.min(100, event.deltaY * lines)) * 0.0015 * this.view.distance;
-    this.onMove(move(this.view.camera, [0, 0, forward]));
+    const turned = Math.max(-100, Math.min(100, event.deltaY * lines)) * 0.0015;
+    const { camera, distance, dragMode } = this.view;
+    // The pivot of an orbit stays where it is: the camera comes nearer to it and never passes it.
+    const left = dragMode === "orbit" ? distance * Math.exp(turned) : distance;
+    const forward = dragMode === "orbit" ? distance - left : -turned * distance;
+    this.view.distance = left;
+    this.onMove(move(camera, [0, 0, forward]));
   }
 
   keyDown(event) {
-    const isField = event.target.closest?.("input, select, textarea, dialog");
+    const isField = event.target.closest?.("input:not([type=range]), select, textarea, dialog");
     if (isField || event.ctrlKey || event.metaKey || event.altKey) return;
     const key = event.key.toLowerCase();
+    // Arrows move a slider in focus.
+    if (event.target.matches?.("input[type=range]") && LOOKS[key]) return;
     this.isFast = event.shiftKey;
     if (!MOVES[key] && !LOOKS[key]) return;
     event.preventDefault();

@@ -86,6 +86,12 @@ function nearestFrame() {
   return gaps.indexOf(Math.min(...gaps));
 }
 
+/** Shows the view of a camera that was not reached by moving: the pivot lies at the scene's distance again. */
+function jumpTo(camera) {
+  view.distance = view.scene.focus;
+  setCamera(camera);
+}
+
 function setCamera(camera) {
   if (view.compareFrame !== null) stopComparing();
   view.camera = camera;
@@ -250,7 +256,7 @@ function drawKeyframes() {
     const number = document.createElement("span");
     number.textContent = i + 1;
     button.append(camera.thumbnail, number, remove);
-    button.onclick = () => setCamera(camera);
+    button.onclick = () => jumpTo(camera);
     return button;
   });
   $("keyframes").replaceChildren(...buttons);
@@ -311,7 +317,7 @@ function fillPanel(header, share) {
     const number = document.createElement("span");
     number.textContent = `frame ${one.frame}`;
     button.append(document.createElement("canvas"), number);
-    button.onclick = () => setCamera(view.scene.context[i]);
+    button.onclick = () => jumpTo(view.scene.context[i]);
     return button;
   }));
   $("contexts").style.gridTemplateColumns = `repeat(${Math.min(4, header.context.length)}, 1fr)`;
@@ -492,7 +498,7 @@ async function copyCommand() {
 function goHome() {
   if (!view.scene) return;
   const gaps = view.scene.context.map((camera) => difference(camera, view.camera));
-  setCamera(view.scene.context[gaps.indexOf(Math.min(...gaps))]);
+  jumpTo(view.scene.context[gaps.indexOf(Math.min(...gaps))]);
 }
 
 function stepTokens(by) {
@@ -576,17 +582,19 @@ $("export").onclick = exportPath;
 $("copy-command").onclick = copyCommand;
 $("map").onclick = (event) => {
   const i = view.scene ? map.cameraAt(event) : -1;
-  if (i >= 0) setCamera(view.scene.context[i]);
+  if (i >= 0) jumpTo(view.scene.context[i]);
 };
 new ResizeObserver(() => {
   layout();
   drawMap();
 }).observe($("stage"));
 addEventListener("keydown", (event) => {
-  const isField = event.target.closest?.("input:not([type=range]), select, dialog, button");
-  if (isField || event.ctrlKey || event.metaKey || event.altKey || !view.scene) return;
+  const isField = event.target.closest?.("input:not([type=range]), select, dialog");
+  // A button in focus takes the keys that press it.
+  const isPressed = event.target.closest?.("button") && (event.key === " " || event.key === "Enter");
+  if (isField || isPressed || event.ctrlKey || event.metaKey || event.altKey || !view.scene) return;
   const context = /^[1-9]$/.test(event.key) ? view.scene.context[event.key - 1] : null;
-  const action = context ? () => setCamera(context) : KEYS[event.key.toLowerCase()];
+  const action = context ? () => jumpTo(context) : KEYS[event.key.toLowerCase()];
   if (!action) return;
   event.preventDefault();
   action();

@@ -111,6 +111,9 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
             usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
         }
     }
+    if args.save_clusters.as_ref() == Some(&args.out) {
+        usage_bail!("--save-clusters and -o name one file, {}; choose another name", args.out.display());
+    }
     let model_args = ModelArgs::find(&args.model, args.data.as_deref(), &args.overrides)?;
     let ModelArgs { given, path, config, .. } = &model_args;
     if config.model.has_latents() && args.save_clusters.is_some() {
@@ -159,12 +162,16 @@ fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// Returns the positions of frames that are given by position or file name.
+/// Returns the positions of frames that are given by position or file name. Numbers alone are positions, unless one has
+/// leading zeros, as names of images have.
 fn frame_positions(
     frames: &[String],
     names: impl FnOnce() -> Result<Vec<String>, DataError>,
 ) -> anyhow::Result<Vec<usize>> {
-    if let Ok(positions) = frames.iter().map(|frame| frame.parse()).collect() {
+    let is_padded = |frame: &String| frame.len() > 1 && frame.starts_with('0');
+    if !frames.iter().any(is_padded)
+        && let Ok(positions) = frames.iter().map(|frame| frame.parse()).collect()
+    {
         return Ok(positions);
     }
     let names = names()?;
@@ -306,14 +313,15 @@ mod tests {
     fn context_frames_are_positions_or_file_names() {
         let positions = |frames: &[&str]| {
             let frames: Vec<String> = frames.iter().map(ToString::to_string).collect();
-            let names = || Ok(["a.jpg", "b.v2.png", "7.png", "0"].map(String::from).to_vec());
+            let names = || Ok(["a.jpg", "b.v2.png", "7.png", "0", "003.jpg"].map(String::from).to_vec());
             frame_positions(&frames, names).map_err(|error| error.to_string())
         };
         assert_eq!(positions(&["7", "0"]).unwrap(), [7, 0], "numbers alone are positions");
+        assert_eq!(positions(&["003", "1"]).unwrap(), [4, 1], "with leading zeros, names");
         assert_eq!(positions(&["b.v2.png", "a", "7.png", "2"]).unwrap(), [1, 0, 2, 2]);
         assert_eq!(
             positions(&["a.jpg", "c.jpg"]).unwrap_err(),
-            "--context: no frame c.jpg; the 4 frames start with a.jpg, b.v2.png, 7.png, 0"
+            "--context: no frame c.jpg; the 5 frames start with a.jpg, b.v2.png, 7.png, 0, 003.jpg"
         );
         let message = frame_positions(&["a.jpg".into()], || Ok(Vec::new())).unwrap_err().to_string();
         assert!(message.contains("write positions"), "{message}");

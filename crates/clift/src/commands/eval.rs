@@ -23,6 +23,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         (None, Some(run)) => run,
         (None, None) => unreachable!("clap requires a run or --checkpoint"),
     };
+    if model.is_none() && folder.join("config.toml").exists() && !folder.join("run.json").exists() {
+        let model = folder.display();
+        usage_bail!("{model} is a model, not a run; evaluate it with `clift eval --checkpoint {model} --data DIR`");
+    }
     let config = eval_config(args, folder)?;
     let results = if args.split == Split::Train { "eval-train" } else { "eval" };
     let out: PathBuf = args.out.clone().unwrap_or_else(|| folder.join(results));

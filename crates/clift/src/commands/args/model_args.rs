@@ -44,6 +44,9 @@ impl ModelArgs {
 
     /// Reads the config of a model. The config of an imported model has no data.
     pub fn new(model: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
+        if !model.exists() {
+            usage_bail!("{}: no such file or folder", model.display());
+        }
         let path = ModelPath::find(model)?;
         let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
         check_network(&config.model, &path)?;

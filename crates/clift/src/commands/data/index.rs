@@ -31,8 +31,8 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     for note in &report.notes {
         print_note(&format!("note: {note}"));
     }
-    let used = plural(report.num_used(), "scene");
-    print_result(&format!("{used} of {} with views: {}", report.num_scenes, args.out.display()))?;
+    let file = if report.num_used() > 0 { args.out.display().to_string() } else { "no file written".into() };
+    print_result(&format!("{} of {} with views: {file}", plural(report.num_used(), "scene"), report.num_scenes))?;
     for (reason, number) in report.counts() {
         print_result(&format!("null: {number} {reason}"))?;
     }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
 use crate::files::listing::natural_order;
+use crate::skip_report::plural;
 use crate::sources::photos::colmap::model::Model;
 use crate::sources::photos::colmap::{binary, text};
 use crate::sources::photos::image_folder::ImageFolders;
@@ -95,6 +96,7 @@ fn other_models(model: &Path) -> Vec<String> {
         return Vec::new();
     }
     let others = (1..100).take_while(|number| model_files(&model.with_file_name(number.to_string())).is_some()).count();
-    let note = || format!("{} has {others} more models; only model 0 is used", model.display());
+    let folder = model.parent().unwrap_or(model).display();
+    let note = || format!("{folder} has {}; only model 0 is used", plural(others, "more model"));
     (others > 0).then(note).into_iter().collect()
 }
