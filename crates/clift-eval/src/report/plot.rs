@@ -9,7 +9,7 @@ use crate::report::axis::{Axis, Scale};
 // Small enough for readable text where the plot shrinks to the width of a phone.
 const WIDTH: f64 = 460.0;
 const HEIGHT: f64 = 320.0;
-const LEFT: f64 = 56.0;
+const LEFT: f64 = 64.0;
 const RIGHT: f64 = 12.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 48.0;

@@ -68,8 +68,14 @@ impl Evaluation {
         let mut views: BTreeMap<RowKey, BTreeMap<View, Values>> = BTreeMap::new();
         for row in csv::Reader::from_path(&file).map_err(bad)?.deserialize() {
             let row: Row = row.map_err(bad)?;
+            // Former names.
+            let method = match row.method.as_str() {
+                "patch" => "tile".into(),
+                "patch_clift" => "tile_clift".into(),
+                _ => row.method,
+            };
             let key = RowKey {
-                method: row.method,
+                method,
                 num_storage_tokens: row.num_storage_tokens,
                 num_render_tokens: row.num_render_tokens,
                 tokens: row.tokens,
@@ -151,6 +157,10 @@ pub struct Comparison {
     pub b: PathBuf,
     /// One row per common key.
     pub pairs: Vec<PairedRow>,
+    /// Keys of the first evaluation without a row.
+    pub only_a: Vec<RowKey>,
+    /// Keys of the second evaluation without a row.
+    pub only_b: Vec<RowKey>,
 }
 
 impl Comparison {
@@ -196,7 +206,13 @@ impl Comparison {
                 first(b)
             )));
         }
-        Ok(Self { a: a.path.clone(), b: b.path.clone(), pairs })
+        // Methods that are not asked for are left out on purpose.
+        let without_row = |of: &Evaluation, side: fn(&PairedRow) -> &RowKey| -> Vec<RowKey> {
+            let keys = of.views.keys().filter(|_| sides.is_none());
+            keys.filter(|key| !pairs.iter().any(|pair| side(pair) == *key)).cloned().collect()
+        };
+        let (only_a, only_b) = (without_row(a, |pair| &pair.a), without_row(b, |pair| &pair.b));
+        Ok(Self { a: a.path.clone(), b: b.path.clone(), pairs, only_a, only_b })
     }
 }
 

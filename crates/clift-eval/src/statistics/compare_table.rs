@@ -53,6 +53,15 @@ impl fmt::Display for Comparison {
                  and {only_b} views of B are ignored."
             )?;
         }
+        for (side, keys) in [("A", &self.only_a), ("B", &self.only_b)] {
+            if !keys.is_empty() {
+                let keys = keys.iter().map(RowKey::to_string).collect::<Vec<_>>().join(", ");
+                writeln!(f, "Only in {side}, not compared: {keys}.")?;
+            }
+        }
+        if !self.only_a.is_empty() && !self.only_b.is_empty() {
+            writeln!(f, "Other formats or methods are compared with `--methods A,B`, such as clift:f32,clift:f16.")?;
+        }
         Ok(())
     }
 }

@@ -38,7 +38,7 @@ export class Connection {
       this.onReply(header, parts);
     };
     socket.onclose = ({ reason }) => {
-      this.onState(reason ? `The server closed the connection: ${reason}.` : "No connection to clift view. Trying again …");
+      this.onState(reason ? `The server closed the connection: ${reason}.` : "No connection to clift view. After a restart, open the URL that it printed. Trying again …");
       setTimeout(() => this.open(), this.retryMs);
       this.retryMs = Math.min(2 * this.retryMs, LAST_RETRY_MS);
     };

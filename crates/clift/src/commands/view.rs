@@ -56,9 +56,13 @@ pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
     let server = ViewServer::bind((args.listen, args.port).into())?;
     let (url, port) = (server.url(), server.address().port());
     print_result(&url)?;
-    print_note(&format!(
-        "Ctrl-C ends; from another machine: ssh -N -L {port}:127.0.0.1:{port} HOST, then the same URL"
-    ));
+    let local = server.address();
+    print_note(&if args.listen.is_unspecified() {
+        "Ctrl-C ends; from another machine: the same URL with the name of this machine instead of the address"
+            .to_owned()
+    } else {
+        format!("Ctrl-C ends; from another machine: ssh -N -L {port}:{local} HOST, then the same URL")
+    });
     if !args.listen.is_loopback() {
         print_warning("whoever has the URL can use the page; the connection is not encrypted");
     }
@@ -88,7 +92,7 @@ fn open_file(file: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
 
 fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
     if args.model.is_some() {
-        usage_bail!("--model is for scene files; {} is a directory and has its own weights", scene.display());
+        usage_bail!("--model is for scene files, {} is a folder; write `clift view RUN DIR`", scene.display());
     }
     let model_args = ModelArgs::find(scene, args.data.as_deref(), &args.overrides)?;
     let opened = model_args.open_data(args.split)?;

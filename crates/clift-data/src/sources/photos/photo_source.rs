@@ -200,7 +200,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
             let what = match example {
                 None => "no frames listed".into(),
                 Some(MissingPhoto { name, .. }) if without_image => {
-                    format!("none of {num_listed} frames has an image; the first is {name}")
+                    format!("none of {num_listed} frames has an image; the first is {name}; data.files.image_folder names another folder of images")
                 }
                 Some(MissingPhoto { name, reason }) => {
                     format!("none of {num_listed} frames is usable; {name} is a frame {reason}")

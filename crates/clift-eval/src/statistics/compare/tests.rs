@@ -51,6 +51,20 @@ fn differences_are_paired_by_view() {
 }
 
 #[test]
+fn keys_of_one_side_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let a = evaluation(folder.path(), "a", &["x,1,clift,8,8,20,,,,,f32", "x,1,patch,8,8,19,,,,,f32"]);
+    let b = evaluation(folder.path(), "b", &["x,1,clift,8,8,20,,,,,f16", "x,1,tile,8,8,19,,,,,f32"]);
+    let comparison = Comparison::new(&a, &b, None).unwrap();
+    assert_eq!(comparison.pairs.len(), 1, "a former name is the present one's");
+    let text = comparison.to_string();
+    assert!(text.contains("Only in A, not compared: clift 8 f32.\nOnly in B, not compared: clift 8 f16.\n"), "{text}");
+    let sides = ["clift:f32", "clift:f16"].map(MethodFilter::parse);
+    let comparison = Comparison::new(&a, &b, Some(&sides)).unwrap();
+    assert!(comparison.only_a.is_empty() && comparison.only_b.is_empty());
+}
+
+#[test]
 fn consistent_differences_are_clear() {
     let of = |shift: f64| {
         let pairs: Vec<(f64, f64)> =

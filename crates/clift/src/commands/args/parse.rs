@@ -83,8 +83,8 @@ pub(crate) fn parse_budget_ms(text: &str) -> Result<f64, String> {
 
 /// Parses a loss of PSNR in dB.
 pub(crate) fn parse_loss(text: &str) -> Result<f64, String> {
-    let loss = text.parse().ok().filter(|loss: &f64| (1e-3..=1e3).contains(loss));
-    loss.ok_or_else(|| "write a loss in dB, 0.001 or more".into())
+    let loss = text.parse().ok().filter(|loss: &f64| (1e-3..=10.0).contains(loss));
+    loss.ok_or_else(|| "write a loss in dB, 0.001 to 10".into())
 }
 
 /// Parses a size in kB.
