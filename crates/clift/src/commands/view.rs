@@ -56,13 +56,14 @@ pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
     let server = ViewServer::bind((args.listen, args.port).into())?;
     let (url, port) = (server.url(), server.address().port());
     print_result(&url)?;
-    let local = server.address();
-    print_note(&if args.listen.is_unspecified() {
-        "Ctrl-C ends; from another machine: the same URL with the name of this machine instead of the address"
-            .to_owned()
+    let remote = if args.listen.is_loopback() {
+        format!("ssh -N -L {port}:{} HOST, then the same URL", server.address())
+    } else if args.listen.is_unspecified() {
+        "the same URL with the name of this machine instead of the address".into()
     } else {
-        format!("Ctrl-C ends; from another machine: ssh -N -L {port}:{local} HOST, then the same URL")
-    });
+        "the same URL".into()
+    };
+    print_note(&format!("Ctrl-C ends; from another machine: {remote}"));
     if !args.listen.is_loopback() {
         print_warning("whoever has the URL can use the page; the connection is not encrypted");
     }
