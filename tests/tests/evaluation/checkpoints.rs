@@ -177,6 +177,8 @@ fn heads_unlike_the_weights_are_refused() {
     place
         .clift(&format!("eval --checkpoint {model} {DATA} --out DIR/eval {SMALL} --set model.num_heads=5"))
         .fails_with(2, &["--set model: the weights were trained with another network"]);
+    place.clift(&format!("eval {model}")).fails_with(2, &["is a model, not a run", "clift eval --checkpoint"]);
+    assert!(!place.at("model/eval").exists());
 
     let network = "model={variant='released-re10k', dim=15, num_heads=5, feed_forward_dim=22, num_encoder_blocks=1, \
                    num_renderer_blocks=2}";

@@ -89,6 +89,18 @@ fn what_the_data_refutes_is_refused_before_any_step() {
     train_on(&place, "run --only stage1", &repository(MINI), &[]).ok();
 }
 
+#[test]
+fn evaluated_scenes_that_train_are_named() {
+    let place = Place::new();
+    let data = changed_scene(&place, |_| ());
+    std::fs::remove_dir_all(data.join("test")).unwrap();
+    copy_folder(&data.join("train"), &data.join("test"));
+    let warning = format!("2 scenes of the evaluation have the keys of training scenes, such as {}", KEYS[0]);
+    train_on(&place, "run --only stage1", &data, &[]).ok().notes(&warning);
+    let ran = train_on(&place, "other --only stage1", &repository(MINI), &[]).ok();
+    assert!(!ran.stderr.contains("the keys of training scenes"), "{}", ran.stderr);
+}
+
 #[cfg(not(feature = "wgpu"))]
 #[test]
 fn missing_devices_are_refused_with_the_build_command() {

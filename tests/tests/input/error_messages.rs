@@ -44,7 +44,8 @@ const CONFIGS: [(&str, &str, &str); 32] = [
 ];
 
 /// Name and `--set` for the valid config.
-const OVERRIDES: [(&str, &str); 8] = [
+const OVERRIDES: [(&str, &str); 9] = [
+    ("synthetic-scenes-with-a-folder", "data.root=\"photos\""),
     ("override-without-a-value", "stage1.steps"),
     ("override-of-an-unknown-key", "stage1.step=3"),
     ("override-below-a-value", "stage1.steps.x=3"),
