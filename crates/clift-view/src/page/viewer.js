@@ -22,7 +22,7 @@ const picture = $("picture");
 const truth = $("truth");
 
 const view = {
-  hello: null, scene: null, camera: null, distance: 2, dragMode: "orbit", selection: "scaled", precision: "f32",
+  hello: null, scene: null, camera: null, distance: 2, dragMode: "orbit", selection: "scaled", precision: null,
   overlay: "none", compareFrame: null, comparison: null, bits: null, sceneKey: null,
 };
 const path = new CameraPath();
@@ -121,6 +121,7 @@ function onHello(hello) {
     changed();
   });
   $("precision-row").hidden = hello.precisions.length < 2;
+  view.precision = hello.default_precision;
   segments("precision", hello.precisions, view.precision, (value) => {
     view.precision = value;
     changed();
@@ -359,7 +360,7 @@ function commandText() {
   const size = scene.sizes[Number($("size").value)];
   const words = [scene.render_command, "--path poses.json", "-o frames"];
   if (tokens < scene.stored) words.push(`--render ${tokens} --selection ${selection}`);
-  if (precision !== "f32") words.push(`--precision ${precision}`);
+  words.push(`--precision ${precision}`);
   if (size.join() !== scene.size.join()) words.push(`--size ${size.join("x")}`);
   return [scene.encode_command, words.join(" ")].filter(Boolean).join("\n");
 }

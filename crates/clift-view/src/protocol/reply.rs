@@ -11,6 +11,7 @@ pub struct Hello {
     pub selections: Vec<&'static str>,
     pub default_selection: &'static str,
     pub precisions: Vec<&'static str>,
+    pub default_precision: &'static str,
     pub version: &'static str,
 }
 

@@ -56,9 +56,9 @@ pub struct RenderArgs {
     /// Device: flex, ndarray or wgpu [default: flex]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceName>,
-    /// Operands of matrix products: f32, or bf16 or f16 if the device supports it
-    #[arg(long, value_name = "PRECISION", default_value_t)]
-    pub precision: Precision,
+    /// Operands of matrix products: f32, bf16 or f16 [default: bf16 if the CPU has its instructions, else f32]
+    #[arg(long, value_name = "PRECISION")]
+    pub precision: Option<Precision>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -9,8 +9,8 @@ use clift_data::{
 };
 use clift_eval::available_bytes;
 use clift_model::{
-    DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, RenderBudget, Scene, SceneRenderer,
-    ViewCamera, frame_bytes, frames_per_call, load_renderer,
+    DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, RenderBudget, Scene,
+    SceneRenderer, ViewCamera, frame_bytes, frames_per_call, load_renderer,
 };
 use serde::Serialize;
 
@@ -35,6 +35,7 @@ struct Report {
     /// Patch grids that each frame is the mean of.
     patch_grids: PatchGrids,
     device: &'static str,
+    precision: Precision,
     height: usize,
     width: usize,
     num_frames: usize,
@@ -73,8 +74,9 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let stop = interrupt::flag()?;
     let opened = device.open()?;
-    args.precision.check("--precision", &opened)?;
-    let _precision = args.precision.scope();
+    let precision = args.precision.unwrap_or_else(|| Precision::for_pictures(&opened));
+    precision.check("--precision", &opened)?;
+    let _precision = precision.scope();
     let network = load_renderer(&scene, &weights, &opened)?;
     let mut renderer = SceneRenderer::new(&scene, network, args.selection.rules(), &opened)?;
     renderer.set_patch_grids(patch_grids);
@@ -90,6 +92,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         selection: (num_render_tokens < scene.num_tokens()).then(|| args.selection.name()),
         patch_grids,
         device: device.as_str(),
+        precision,
         height,
         width,
         num_frames: views.len(),
@@ -104,7 +107,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     frames::remove_later_frames(&args.out, views.len()).with_context(creating)?;
     print_result(&format!(
         "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
-         {:.1} ms per frame on {device} (median): {:.1} ms token selection, {:.1} ms rendering",
+         {:.1} ms per frame on {device} in {precision} (median): {:.1} ms token selection, {:.1} ms rendering",
         args.out.display(),
         views.len(),
         scene.num_tokens(),
