@@ -69,12 +69,13 @@ pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Cameras and poses.
 pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
-pub use geometry::camera_path::{PathView, focus_distance, interpolate_path, mean_intrinsics, orbit_path, read_poses};
+pub use geometry::camera_path::{PathView, focus_distance, interpolate_path, mean_intrinsics, orbit_path};
 pub use geometry::lens::Lens;
 pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
 pub use geometry::overlap::overlap;
 pub use geometry::path_spread::contexts_along_path;
 pub use geometry::pose::Pose;
+pub use geometry::pose_file::read_poses;
 pub use glam::{DMat3, DVec3};
 
 // Images.

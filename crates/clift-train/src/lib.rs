@@ -58,7 +58,7 @@ pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 pub use token_codec::fit_token_codec;
 // One update
-pub use step::batch::{StageBatch, TokenSelection};
+pub use step::batch::{BatchTokens, StageBatch};
 pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{ImageLoss, Loss, LossParts, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;

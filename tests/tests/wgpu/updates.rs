@@ -2,7 +2,7 @@
 
 use clift_eval::upload_images;
 use clift_model::{Clift, Clusters, RenderTokens};
-use clift_train::{Loss, OptimizerConfig, Stage, StageBatch, TokenSelection, TrainState, freeze};
+use clift_train::{BatchTokens, Loss, OptimizerConfig, Stage, StageBatch, TrainState, freeze};
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
@@ -28,8 +28,8 @@ pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> T
 
 pub fn batch(place: &Place, stage: Stage) -> StageBatch {
     let tokens = match stage {
-        Stage::Stage2 => TokenSelection::Clusters(clusters()),
-        _ => TokenSelection::Subsets(subsets(5)),
+        Stage::Stage2 => BatchTokens::Clusters(clusters()),
+        _ => BatchTokens::Subsets(subsets(5)),
     };
     StageBatch { clips: place.clips(), tokens, skipped: Vec::new() }
 }
@@ -56,12 +56,12 @@ fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: b
 fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
     let lift = model.encode(&place.context());
     let tokens: RenderTokens = match &batch.tokens {
-        TokenSelection::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
-        TokenSelection::Clusters(clusters) => {
+        BatchTokens::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+        BatchTokens::Clusters(clusters) => {
             let index = Clusters::new(clusters.clone()).expect("equal counts").upload(&place.device);
             model.condenser.forward(lift, &index).into()
         }
-        TokenSelection::All => lift.into(),
+        BatchTokens::All => lift.into(),
     };
     let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
     let pictures = upload_images(&targets, &place.device).expect("equal sizes");

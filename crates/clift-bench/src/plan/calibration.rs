@@ -9,7 +9,7 @@ use clift_data::{ClipReader, Split, item_rng, median, open_dataset, step_rng};
 use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
-    ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TokenSelection, TrainError, TypicalStep, clip_global_norm,
+    BatchTokens, ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TrainError, TypicalStep, clip_global_norm,
     eval_sizes, global_norm, measures_lpips, render_loss, scene_with_all_tokens, seeded_batch, seeded_clip,
 };
 use cpu_time::ProcessTime;
@@ -187,7 +187,7 @@ fn calibration_batch(
             let subset = |_| sample(&mut rng, num_tokens, kept).into_iter().map(|token| token as u32).collect();
             (0..clip.target.num_views()).map(subset).collect()
         });
-        batch.tokens = TokenSelection::Subsets(subsets.collect());
+        batch.tokens = BatchTokens::Subsets(subsets.collect());
     }
     Ok(batch)
 }

@@ -1,17 +1,8 @@
-//! Camera paths for rendering: through the context views, an orbit around their focus, or read from a file.
-
-use std::ops::RangeInclusive;
-use std::path::Path;
+//! Camera paths for rendering: through the context views, or an orbit around their focus.
 
 use glam::{DMat3, DVec3};
-use serde::Deserialize;
-use serde::de::IgnoredAny;
 
-use crate::error::DataError;
-use crate::files::bounded::parse_json;
-use crate::files::listing::natural_order;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
-use crate::geometry::normalization::{PoseNormalization, check_near};
+use crate::geometry::camera::Intrinsics;
 use crate::geometry::pose::Pose;
 
 /// Radius of an orbit over the extent of the context centres; farther out the contexts show little.
@@ -22,7 +13,6 @@ const MIN_ORBIT_RADIUS: f64 = 0.1;
 const FOCUS: f64 = 2.0;
 /// Bounds of the distance otherwise.
 const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
-const MAX_POSES: usize = 100_000;
 
 /// One view to render, in the scene's normalised frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,119 +95,9 @@ fn look_at(centre: DVec3, point: DVec3) -> Pose {
     Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: centre }
 }
 
-/// Accepted focal lengths over width and height; the upper bound also limits the principal point's distance from 0.
-const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct PoseFile {
-    poses: Vec<FilePose>,
-}
-
-/// The keys that tell the form of a file.
-#[derive(Deserialize)]
-struct FileForm {
-    poses: Option<IgnoredAny>,
-    frames: Option<IgnoredAny>,
-}
-
-/// The poses of a `transforms.json`.
-#[derive(Deserialize)]
-struct TransformsFile {
-    frames: Vec<TransformsFrame>,
-}
-
-/// One frame of a `transforms.json`.
-#[derive(Deserialize)]
-struct TransformsFrame {
-    #[serde(default)]
-    file_path: String,
-    /// Three or four rows of a camera-to-world matrix, OpenGL axes.
-    transform_matrix: Vec<[f64; 4]>,
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct FilePose {
-    /// Three or four rows of a camera-to-world matrix in the capture's world, OpenCV axes.
-    c2w: Vec<[f64; 4]>,
-    /// `fx, fy, cx, cy` over width and height. Default: the mean of the context views.
-    #[serde(default)]
-    intrinsics_norm: Option<[f64; 4]>,
-}
-
-/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}` and normalises the poses.
-///
-/// Poses are camera to world in the world of the capture's files, OpenCV axes. Images have `width` by `height` pixels.
-/// A pose without intrinsics gets `default`.
-///
-/// The file may also be the `transforms.json` of the capture: its poses in the natural order of the image names, all with
-/// the intrinsics `default`.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with the position of the pose.
-pub fn read_poses(
-    path: &Path,
-    normalization: &PoseNormalization,
-    default: Intrinsics,
-    width: usize,
-    height: usize,
-) -> Result<Vec<PathView>, DataError> {
-    let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
-    let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
-    let wrong_form = |error: serde_json::Error| {
-        bad(format!("expected a transforms.json or {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))
-    };
-    let form = parse_json(&text).unwrap_or(FileForm { poses: None, frames: None });
-    let is_transforms = form.frames.is_some() && form.poses.is_none();
-    let poses: Vec<FilePose> = if is_transforms {
-        let mut file: TransformsFile = parse_json(&text).map_err(wrong_form)?;
-        file.frames.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
-        let pose = |frame: TransformsFrame| FilePose { c2w: frame.transform_matrix, intrinsics_norm: None };
-        file.frames.into_iter().map(pose).collect()
-    } else {
-        let file: PoseFile = parse_json(&text).map_err(wrong_form)?;
-        file.poses
-    };
-    if !(1..=MAX_POSES).contains(&poses.len()) {
-        return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", poses.len())));
-    }
-    let from_rows = if is_transforms { Pose::from_opengl } else { Pose::from_rows };
-    let is_near = |cx: f64, cy: f64| [cx, cy].iter().all(|centre| centre.abs() <= *INTRINSICS.end());
-    let view = |(position, pose): (usize, FilePose)| {
-        let bad = |what: String| bad(format!("pose {position}: {what}"));
-        let (rows, last) = match pose.c2w[..] {
-            [a, b, c] => ([a, b, c], [0.0, 0.0, 0.0, 1.0]),
-            [a, b, c, last] => ([a, b, c], last),
-            _ => return Err(bad(format!("{} rows, expected 3 or 4", pose.c2w.len()))),
-        };
-        if last != [0.0, 0.0, 0.0, 1.0] {
-            return Err(bad(format!("the last row is {last:?}, expected [0, 0, 0, 1]")));
-        }
-        let c2w = normalization.normalize(from_rows(&rows).map_err(|error| bad(error.to_string()))?);
-        check_near(&c2w).map_err(|error| bad(error.to_string()))?;
-        let intrinsics = match pose.intrinsics_norm {
-            None => default,
-            Some([fx, fy, cx, cy]) if INTRINSICS.contains(&fx) && INTRINSICS.contains(&fy) && is_near(cx, cy) => {
-                IntrinsicsNorm { fx, fy, cx, cy }.to_pixels(width, height)
-            }
-            Some(other) => {
-                let most = INTRINSICS.end();
-                return Err(bad(format!(
-                    "intrinsics_norm is {other:?}; expected fx and fy from {} to {most}, cx and cy within {most} of 0",
-                    INTRINSICS.start()
-                )));
-            }
-        };
-        Ok(PathView { c2w, intrinsics })
-    };
-    poses.into_iter().enumerate().map(view).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::read_from_file;
 
     const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
 
@@ -286,65 +166,5 @@ mod tests {
         assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "smallest radius for contexts on a line");
         assert_eq!(focus_distance(&[view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)]), FOCUS, "parallel axes");
         assert!(orbit_path(&[], 3).is_empty());
-    }
-
-    fn read(json: &str) -> Result<Vec<PathView>, DataError> {
-        let frame = PoseNormalization { mean_c2w: view([1.0, 0.0, 0.0], 0.0).c2w, scale: 2.0 };
-        read_from_file("poses.json", json, |path| read_poses(path, &frame, K, 64, 32))
-    }
-
-    #[test]
-    fn poses_of_a_file_are_normalised() {
-        let views = read(
-            r#"{"poses": [{"c2w": [[1,0,0,501],[0,1,0,0],[0,0,1,0.5]]},
-                {"c2w": [[1,0,0,1],[0,1,0,0],[0,0,1,0],[0,0,0,1]], "intrinsics_norm": [0.5, 1.0, 0.5, 0.25]}]}"#,
-        )
-        .unwrap();
-        assert_close(&views[0], &view([1000.0, 0.0, 1.0], 0.0), 1e-12);
-        assert_eq!(views[0].intrinsics, K);
-        assert_close(&views[1], &view([0.0; 3], 0.0), 1e-12);
-        assert_eq!(views[1].intrinsics, Intrinsics { fx: 32.0, fy: 32.0, cx: 32.0, cy: 8.0 });
-    }
-
-    #[test]
-    fn poses_of_a_transforms_file_have_opengl_axes() {
-        let views = read(
-            r#"{"w": 64, "frames": [
-                {"file_path": "b/10.jpg", "transform_matrix": [[1,0,0,5],[0,-1,0,0],[0,0,-1,2],[0,0,0,1]]},
-                {"file_path": "b/9.jpg", "transform_matrix": [[1,0,0,1],[0,-1,0,0],[0,0,-1,0],[0,0,0,1]]}]}"#,
-        )
-        .unwrap();
-        assert_close(&views[0], &view([0.0; 3], 0.0), 1e-12);
-        assert_close(&views[1], &view([8.0, 0.0, 4.0], 0.0), 1e-12);
-        assert_eq!(views[1].intrinsics, K);
-    }
-
-    #[test]
-    fn invalid_pose_files_name_pose_and_problem() {
-        for (json, part) in [
-            ("[]", "expected a transforms.json or {\"poses\": "),
-            (r#"{"poses": []}"#, "0 poses, expected 1 to 100000"),
-            (r#"{"poses": [{"c2w": [[1,0,0,0]]}]}"#, "pose 0: 1 rows, expected 3 or 4"),
-            (r#"{"poses": [{"c2w": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: the rotation is off"),
-            (r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,2]]}]}"#, "the last row is"),
-            (
-                r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [0,1,0,0]}]}"#,
-                "pose 0: intrinsics_norm is [0.0, 1.0",
-            ),
-            (
-                r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [1,1,1e39,0.5]}]}"#,
-                "pose 0: intrinsics_norm is [1.0, 1.0, 1e39",
-            ),
-            (
-                r#"{"poses": [{"c2w": [[1,0,0,506],[0,1,0,0],[0,0,1,0]]}]}"#,
-                "pose 0: bad camera: the camera is 1010 times the contexts' extent away",
-            ),
-            (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
-            (r#"{"frames": []}"#, "0 poses, expected 1 to 100000"),
-            (r#"{"frames": [{"file_path": "a.jpg"}]}"#, "missing field `transform_matrix`"),
-        ] {
-            let message = read(json).unwrap_err().to_string();
-            assert!(message.contains(part) && message.ends_with("poses.json"), "{message}");
-        }
     }
 }

@@ -5,7 +5,8 @@
 //! - `lens`: OpenCV and COLMAP lens distortion
 //! - `normalization`: normalised frame of a scene
 //! - `overlap`: view overlap of two cameras
-//! - `camera_path`: interpolated, orbit and file paths
+//! - `camera_path`: interpolated paths and orbits
+//! - `pose_file`: poses to render, from a file
 //! - `path_spread`: context frames spread along a path
 
 pub(crate) mod camera;
@@ -15,3 +16,4 @@ pub(crate) mod normalization;
 pub(crate) mod overlap;
 pub(crate) mod path_spread;
 pub(crate) mod pose;
+pub(crate) mod pose_file;

@@ -9,7 +9,7 @@ use rand::seq::index::sample;
 use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenSelection};
+use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Maker of the batches of stage 1, a pure function of (seed, step).
 pub struct Stage1Batches {
@@ -53,14 +53,14 @@ impl Stage1Batches {
         let share = low + (high - low) * step_rng(self.seed, step, "kept share").random::<f64>();
         let count = ((num_tokens as f64 * share) as usize).clamp(1, num_tokens.max(1));
         let tokens = if count == num_tokens {
-            TokenSelection::All
+            BatchTokens::All
         } else {
             let subsets = self.parts.slots().zip(&clips).map(|(slot, clip)| {
                 let mut rng = item_rng(self.seed, step, slot as u32, 0, "kept tokens");
                 let subset = |_| sample(&mut rng, num_tokens, count).into_iter().map(|token| token as u32).collect();
                 (0..clip.target.num_views()).map(subset).collect()
             });
-            TokenSelection::Subsets(subsets.collect())
+            BatchTokens::Subsets(subsets.collect())
         };
         Ok(StageBatch { clips, tokens, skipped })
     }

@@ -13,7 +13,7 @@ use crate::cluster_cache::cache::{CacheEntry, ClusterCache};
 use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenSelection};
+use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Attempts per slot, repeated entries included, before the batch fails.
 const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
@@ -65,7 +65,7 @@ impl Stage2Batches {
             clips.push(clip);
             clusters.push(scene);
         }
-        Ok(StageBatch { clips, tokens: TokenSelection::Clusters(clusters), skipped })
+        Ok(StageBatch { clips, tokens: BatchTokens::Clusters(clusters), skipped })
     }
 
     /// Samples a group in proportion to its size, so that all entries are equally likely.

@@ -10,7 +10,7 @@ use burn::tensor::{Gradients, Tensor};
 use clift_model::{Cameras, Clift, EncoderBlock, Tokens, Views};
 
 use crate::error::TrainError;
-use crate::step::batch::TokenSelection;
+use crate::step::batch::BatchTokens;
 use crate::step::device_batch::DeviceBatch;
 use crate::step::loss::{Loss, LossParts};
 
@@ -18,7 +18,7 @@ use crate::step::loss::{Loss, LossParts};
 pub(crate) fn backward(
     model: &Clift,
     device_batch: &DeviceBatch,
-    selection: &TokenSelection,
+    batch_tokens: &BatchTokens,
     loss: &Loss,
     share: f64,
     accumulator: &mut GradientsAccumulator<Clift>,
@@ -37,7 +37,7 @@ pub(crate) fn backward(
     let encode = |block: &EncoderBlock, x: Tensor<3>| block.forward(x, context_transforms.as_ref());
     let (encoder_inputs, encoded) = block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), encode);
     let lift = Tokens { values: plain.encoder.to_tokens(encoded.clone()), transforms: context_transforms.clone() };
-    let tokens = selection.apply(&plain.condenser, plain.normalize(lift.clone()))?;
+    let tokens = batch_tokens.apply(&plain.condenser, plain.normalize(lift.clone()))?;
     let blocks: Vec<usize> = (0..plain.renderer.num_blocks()).collect();
     let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&tokens, &targets), &blocks, |&block, x| {
         plain.renderer.block(block, x, &tokens, target_transforms.as_ref())
@@ -81,7 +81,7 @@ pub(crate) fn backward(
 
     let encoded = leaf(encoded);
     let lift = lift.with_values(model.encoder.to_tokens(encoded.clone()));
-    let output = selection.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
+    let output = batch_tokens.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
     let mut grads = backward_from(output, grad_tokens);
     let mut grad_x = take_gradient(&encoded, &mut grads);
     add(grads);
@@ -192,9 +192,9 @@ mod tests {
         pairs.pairs
     }
 
-    fn subsets(count: u32) -> TokenSelection {
+    fn subsets(count: u32) -> BatchTokens {
         let subset = |scene: u32, view: u32| (0..count).map(|i| (5 * i + view + 2 * scene) % 12).collect();
-        TokenSelection::Subsets((0..2).map(|scene| (0..3).map(|view| subset(scene, view)).collect()).collect())
+        BatchTokens::Subsets((0..2).map(|scene| (0..3).map(|view| subset(scene, view)).collect()).collect())
     }
 
     #[test]

@@ -14,7 +14,7 @@ pub struct StageBatch {
     /// One clip per slot.
     pub clips: Vec<Clip>,
     /// Tokens of the renderer, per slot.
-    pub tokens: TokenSelection,
+    pub tokens: BatchTokens,
     /// Scenes that were skipped while a slot was filled, with the slot.
     pub skipped: Vec<(usize, SkippedScene)>,
 }
@@ -22,14 +22,14 @@ pub struct StageBatch {
 /// A part of a batch.
 pub(crate) struct MicroBatch<'a> {
     pub clips: &'a [Clip],
-    pub tokens: TokenSelection,
+    pub tokens: BatchTokens,
     /// Share of the whole batch.
     pub share: f64,
 }
 
 /// Tokens that the renderer receives.
 #[derive(Clone, Debug, PartialEq)]
-pub enum TokenSelection {
+pub enum BatchTokens {
     /// Stage 1: a subset of the scene's tokens for every target view, `[slots][views][K]`.
     Subsets(Vec<Vec<Vec<u32>>>),
     /// Stage 1: every token.
@@ -47,9 +47,9 @@ impl StageBatch {
             let range = start..start + count;
             start = range.end;
             let tokens = match &self.tokens {
-                TokenSelection::Subsets(subsets) => TokenSelection::Subsets(subsets[range.clone()].to_vec()),
-                TokenSelection::All => TokenSelection::All,
-                TokenSelection::Clusters(clusters) => TokenSelection::Clusters(clusters[range.clone()].to_vec()),
+                BatchTokens::Subsets(subsets) => BatchTokens::Subsets(subsets[range.clone()].to_vec()),
+                BatchTokens::All => BatchTokens::All,
+                BatchTokens::Clusters(clusters) => BatchTokens::Clusters(clusters[range.clone()].to_vec()),
             };
             let share = count as f64 / parts.batch_size() as f64;
             (count > 0).then(|| MicroBatch { clips: &self.clips[range], tokens, share })
@@ -57,7 +57,7 @@ impl StageBatch {
     }
 }
 
-impl TokenSelection {
+impl BatchTokens {
     /// Selects the tokens of the renderer from the encoder's tokens.
     pub(crate) fn apply(&self, condenser: &Condenser, lift: Tokens) -> Result<RenderTokens, TrainError> {
         Ok(match self {

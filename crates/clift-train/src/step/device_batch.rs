@@ -7,7 +7,7 @@ use clift_eval::{upload_cameras, upload_images, upload_views};
 use clift_model::{Cameras, Clift, Views};
 
 use crate::error::TrainError;
-use crate::step::batch::TokenSelection;
+use crate::step::batch::BatchTokens;
 use crate::step::loss::{Loss, LossParts};
 
 /// The views of a batch on a device.
@@ -43,10 +43,10 @@ impl DeviceBatch {
 pub fn render_loss(
     model: &Clift,
     device_batch: &DeviceBatch,
-    selection: &TokenSelection,
+    batch_tokens: &BatchTokens,
     loss: &Loss,
 ) -> Result<LossParts, TrainError> {
     let lift = model.encode(&device_batch.context); // [B, N, D]
-    let tokens = selection.apply(&model.condenser, lift)?;
+    let tokens = batch_tokens.apply(&model.condenser, lift)?;
     Ok(loss.of(model.renderer.forward(tokens, &device_batch.targets), device_batch.target_images.clone()))
 }

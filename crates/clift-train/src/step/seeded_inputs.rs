@@ -7,7 +7,7 @@ use clift_model::{Clift, ModelConfig, SceneClusters};
 use rand::{Rng, RngExt};
 
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenSelection};
+use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Numbers and size of the views of a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -90,10 +90,10 @@ pub fn seeded_batch(
     seed: u64,
 ) -> Result<StageBatch, TrainError> {
     let tokens = match num_storage_tokens {
-        None => TokenSelection::All,
+        None => BatchTokens::All,
         Some(count) => {
             let scenes = (0..batch_size).map(|slot| seeded_clusters(num_tokens, count, seed, slot));
-            TokenSelection::Clusters(scenes.collect::<Result<_, _>>()?)
+            BatchTokens::Clusters(scenes.collect::<Result<_, _>>()?)
         }
     };
     let clips = (0..batch_size).map(|slot| seeded_clip(shape, seed, slot)).collect();

@@ -11,11 +11,11 @@ use clift_model::{
 use serde::Serialize;
 
 use crate::commands::args::model_args::ModelArgs;
-use crate::commands::args::parse::{parse_kb, parse_loss, parse_split};
-use crate::commands::args::shared_args::ConfigArgs;
+use crate::commands::args::parse::{parse_kb, parse_loss, parse_output, parse_split};
+use crate::commands::args::shared_args::{ConfigArgs, require_free};
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::json::write_json;
-use crate::output::stdout::{print_result, print_warning};
+use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
 
 const MAX_LISTED_KEYS: usize = 8;
@@ -68,7 +68,7 @@ pub struct EncodeArgs {
     #[arg(long, value_name = "N", value_parser = parse_kb)]
     pub size_kb: Option<f64>,
     /// Also write the cluster of every token, as JSON
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = parse_output)]
     pub save_clusters: Option<PathBuf>,
     #[command(flatten)]
     pub overrides: ConfigArgs,
@@ -107,9 +107,7 @@ impl<'a> ClustersFile<'a> {
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
     for path in [Some(&args.out), args.save_clusters.as_ref()].into_iter().flatten() {
-        if !args.force && path.exists() {
-            usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
-        }
+        require_free(path, args.force)?;
     }
     if args.save_clusters.as_ref() == Some(&args.out) {
         usage_bail!("--save-clusters and -o name one file, {}; choose another name", args.out.display());
@@ -141,7 +139,21 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         write_json(&ClustersFile::of(&encoded), path)?;
     }
     print_result(&describe(&encoded, &written, &args.out))?;
+    let photo = reader.source.image_size(scene, encoded.scene.context_frames[0] as usize)?;
+    if let Some([width, height]) = cropped(photo, [encoded.scene.width, encoded.scene.height]) {
+        print_note(&format!(
+            "of images of {} x {}, the central {width} x {height} pixels are used",
+            photo[0], photo[1]
+        ));
+    }
     print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, given)
+}
+
+/// Returns the size of the central part of an image that has the proportions of the network's; `None` if little is lost.
+fn cropped(image: [usize; 2], network: [usize; 2]) -> Option<[usize; 2]> {
+    let of_other = |side: usize| image[1 - side] * network[side] / network[1 - side];
+    let kept = [0, 1].map(|side| image[side].min(of_other(side)));
+    (0..2).any(|side| kept[side] * 10 < image[side] * 9).then_some(kept)
 }
 
 /// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
@@ -308,6 +320,13 @@ fn find_scene(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usi
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn much_cropping_is_told() {
+        assert_eq!(cropped([1080, 1920], [64, 64]), Some([1080, 1080]));
+        assert_eq!(cropped([4000, 1000], [128, 64]), Some([2000, 1000]));
+        assert_eq!([cropped([64, 64], [64, 64]), cropped([105, 100], [64, 64])], [None, None]);
+    }
 
     #[test]
     fn context_frames_are_positions_or_file_names() {

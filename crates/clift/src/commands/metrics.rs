@@ -9,6 +9,7 @@ use clift_data::replace_file;
 use clift_train::Stage;
 use serde::Deserialize;
 
+use crate::commands::args::shared_args::require_free;
 use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
 use crate::output::tensorboard::{Scalar, event_file};
@@ -49,14 +50,14 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<()> {
     }
     let rows = read_rows(&args.run)?;
     if let Some(path) = &args.csv {
-        require_absent(path, args.force)?;
+        require_free(path, args.force)?;
         write(path, &csv(&rows))?;
     }
     if let Some(folder) = &args.tensorboard {
         for stage in [Stage::Stage1, Stage::Stage2] {
             let path = folder.join(stage.name()).join("events.out.tfevents.0.clift");
             let Some(((_, _), first)) = rows.iter().find(|((found, _), _)| *found == stage) else { continue };
-            require_absent(&path, args.force)?;
+            require_free(&path, args.force)?;
             write(&path, &event_file(first.time, scalars(&rows, stage)))?;
         }
     }
@@ -127,13 +128,6 @@ fn scalars(rows: &Rows, stage: Stage) -> impl Iterator<Item = Scalar<'static>> {
         .flatten()
         .collect::<Vec<_>>()
     })
-}
-
-fn require_absent(path: &Path, force: bool) -> anyhow::Result<()> {
-    if !force && path.exists() {
-        usage_bail!("the file {} exists; replace it with --force or choose another", path.display());
-    }
-    Ok(())
 }
 
 fn write(path: &Path, content: &[u8]) -> anyhow::Result<()> {

@@ -14,7 +14,6 @@ use crate::output::units::{duration, file_size, memory_size, seconds};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, check_plan)?;
-    args.json.check_folder()?;
     for missing in missing_weights(&config) {
         print_warning(missing);
     }

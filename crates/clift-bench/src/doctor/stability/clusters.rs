@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 use clift_model::{KMeans, ModelError, SceneClusters};
-use clift_train::{Stage, TokenSelection, TrainError, seeded_batch, seeded_clusters, seeded_uniform};
+use clift_train::{BatchTokens, Stage, TrainError, seeded_batch, seeded_clusters, seeded_uniform};
 
 use crate::cases::reference::{ToF64, values};
 use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, RunCase, StabilityCase};
@@ -80,6 +80,6 @@ fn condenser_error(
 ) -> Result<Outcome, TrainError> {
     let num_tokens = num_tokens(devices, 4);
     let mut batch = seeded_batch(shape(devices, 4), 2, num_tokens, None, 0)?;
-    batch.tokens = TokenSelection::Clusters(vec![scene(num_tokens)?; 2]);
+    batch.tokens = BatchTokens::Clusters(vec![scene(num_tokens)?; 2]);
     stage_error(devices, Stage::Stage2, &batch)
 }

@@ -5,7 +5,7 @@
 use std::collections::HashSet;
 use std::fmt;
 use std::marker::PhantomData;
-use std::path::{Component, Path, PathBuf};
+use std::path::Path;
 
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
@@ -17,15 +17,13 @@ use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
 use crate::image::codec::read_header;
-use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::image_locator::ImageLocator;
+use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
 
 /// Largest size of a `transforms.json`, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
 /// Longest name of an image, in bytes: the limit of operating systems for a path.
 const MAX_NAME_BYTES: usize = 4096;
-/// Largest number of trailing parts of an image path that are searched in the scene folder.
-const MAX_SUFFIX_PARTS: usize = 32;
 
 /// Defines a struct with the keys of a camera, which may occur at the top level and in a frame.
 macro_rules! with_optics {
@@ -170,7 +168,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         return Err(bad(format!("frame {start}..: its name has {} bytes, more than {MAX_NAME_BYTES}", name.len())));
     }
     entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
-    let mut images = ImageLocator { folder, options, folders: ImageFolders::default() };
+    let mut images = ImageLocator::new(folder, options);
     let (top, mut scene) = (document.optics(), PhotoScene::default());
     let mut used = HashSet::new();
     for entry in entries {
@@ -198,7 +196,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
             .map_err(PhotoScene::in_frame(path, name))?;
         scene.photos.push(photo);
     }
-    scene.num_without_camera = images.folders.num_unrequested();
+    scene.num_without_camera = images.num_unrequested();
     Ok(scene)
 }
 
@@ -209,87 +207,6 @@ fn explain(error: &serde_json::Error, text: &[u8]) -> String {
     let near = String::from_utf8_lossy(&line[column.saturating_sub(9)..line.len().min(column + 9)]);
     let hint = if near.contains("NaN") || near.contains("Infinity") { " (a number is NaN or infinite)" } else { "" };
     format!("expected the format of nerfstudio, got {error}{hint}")
-}
-
-struct ImageLocator<'a> {
-    folder: &'a Path,
-    options: &'a PhotoOptions,
-    folders: ImageFolders,
-}
-
-impl ImageLocator<'_> {
-    fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
-        let found = self.find_at(Path::new(file_path));
-        if found.is_ok() || !file_path.contains('\\') {
-            return found;
-        }
-        // Separator of Windows; some tools mix both.
-        self.find_at(Path::new(&file_path.replace('\\', "/")))
-    }
-
-    fn find_at(&mut self, named: &Path) -> Result<PathBuf, String> {
-        if let Some(folder) = self.image_folder() {
-            let below =
-                if is_absolute(named) { self.longest_suffix(&folder, named) } else { without_first_folder(named) };
-            return self.folders.find(&folder.join(below));
-        }
-        let given = self.folder.join(named);
-        let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
-            return Err(NO_IMAGE.into());
-        };
-        if self.folders.has(parent) {
-            return self.folders.find(&given);
-        }
-        // Only scaled images exist, or the path belongs to another folder or computer.
-        let suffixes = path_suffixes(named).map(|suffix| self.folder.join(suffix));
-        for candidate in std::iter::once(given.clone()).chain(suffixes) {
-            let Some(parent) = candidate.parent().filter(|parent| *parent != self.folder) else { continue };
-            let last = parent.file_name().unwrap_or_default().to_string_lossy();
-            let scaled = ["", "_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
-            if let Some(folder) = scaled.into_iter().find(|folder| self.folders.has(folder)) {
-                return self.folders.find(&folder.join(name));
-            }
-        }
-        if is_absolute(named) {
-            return self.folders.find(&self.folder.join(name));
-        }
-        Err(NO_IMAGE.into())
-    }
-
-    /// Returns the configured image folder, or the first existing default folder.
-    fn image_folder(&mut self) -> Option<PathBuf> {
-        if let Some(folder) = &self.options.image_folder {
-            return Some(self.folder.join(folder));
-        }
-        let mut folders = self.options.first_folders.iter().map(|folder| self.folder.join(folder));
-        folders.find(|folder| self.folders.has(folder))
-    }
-
-    /// Returns the longest suffix of a path whose parent exists in `folder`.
-    fn longest_suffix(&mut self, folder: &Path, named: &Path) -> PathBuf {
-        let mut suffixes = path_suffixes(named);
-        let found =
-            suffixes.find(|suffix| suffix.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
-        found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
-    }
-}
-
-/// Returns the suffixes of a path, from the longest (at most [`MAX_SUFFIX_PARTS`] parts) to the file name.
-fn path_suffixes(path: &Path) -> impl Iterator<Item = PathBuf> {
-    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
-    (parts.len().saturating_sub(MAX_SUFFIX_PARTS)..parts.len()).map(move |start| parts[start..].iter().collect())
-}
-
-/// Returns whether a path is absolute, on Windows or on other systems.
-fn is_absolute(path: &Path) -> bool {
-    let first = path.components().next().map(|part| part.as_os_str().to_string_lossy());
-    path.has_root() || first.is_some_and(|first| first.len() == 2 && first.ends_with(':'))
-}
-
-/// Returns a path without its first folder: `left/1.png` for `images/left/1.png`.
-fn without_first_folder(path: &Path) -> PathBuf {
-    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
-    parts[parts.len().min(2).saturating_sub(1)..].iter().collect()
 }
 
 /// A list of at most `MAX` items, because parsed JSON takes up to a hundred times the memory of its text.
@@ -319,18 +236,5 @@ impl<'de, T: Deserialize<'de>, const MAX: usize> Visitor<'de> for BoundedVisitor
             list.push(item);
         }
         Ok(Bounded(list))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn long_paths_give_bounded_suffixes() {
-        let suffixes = |path: &str| path_suffixes(Path::new(path)).collect::<Vec<_>>();
-        assert_eq!(suffixes("/a/./b/c.png"), ["a/b/c.png", "b/c.png", "c.png"].map(PathBuf::from));
-        let deep = suffixes(&"a/".repeat(2000));
-        assert_eq!((deep.len(), deep[0].components().count()), (MAX_SUFFIX_PARTS, MAX_SUFFIX_PARTS));
     }
 }

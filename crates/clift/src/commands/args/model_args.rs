@@ -12,7 +12,7 @@ use clift_train::{Config, Override};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
-use crate::output::stdout::print_note;
+use crate::output::stdout::{print_note, print_warning};
 
 /// The model that is used where none is named, trained on synthetic scenes.
 const SHIPPED_MODEL: &str = "models/rooms";
@@ -50,6 +50,12 @@ impl ModelArgs {
         let path = ModelPath::find(model)?;
         let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
         check_network(&config.model, &path)?;
+        let sizes = overrides.iter().filter(|change| ["data.width", "data.height"].contains(&change.key.as_str()));
+        for Override { key, from, to, .. } in sizes {
+            if let Some(trained) = from.as_ref().filter(|from| *from != to) {
+                print_warning(format!("--set {key}: the network was trained with {trained}; other sizes lose quality"));
+            }
+        }
         config.device = args.device.unwrap_or(config.device);
         let folder = folder.map(Path::to_path_buf);
         if folder.is_some() {

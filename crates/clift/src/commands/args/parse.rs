@@ -52,9 +52,20 @@ pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
     text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number of at least 1".into())
 }
 
+/// Parses the path of a file to write, before the work whose results it takes.
+pub(crate) fn parse_output(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    match folder.filter(|folder| !folder.is_dir()) {
+        Some(folder) => Err(format!("no folder {}; create it first", folder.display())),
+        None if path.is_dir() => Err("that is a folder; write the name of a file in it".into()),
+        None => Ok(path),
+    }
+}
+
 /// Parses the path of a video, whose extension is `mp4`.
 pub(crate) fn parse_video(text: &str) -> Result<PathBuf, String> {
-    let path = PathBuf::from(text);
+    let path = parse_output(text)?;
     let is_mp4 = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("mp4"));
     if is_mp4 { Ok(path) } else { Err("write a file name that ends with .mp4".into()) }
 }
@@ -123,6 +134,12 @@ mod tests {
         );
         let refused = [parse_size("64"), parse_size("0x4"), parse_size("4x"), parse_distance("6"), parse_views("1+6")];
         assert!(refused.iter().all(Result::is_err) && parse_count("0").is_err(), "{refused:?}");
+        let [file, folder, no_folder] =
+            ["x.mp4", ".", "no/such/x.mp4"].map(|path| (parse_output(path), parse_video(path)));
+        assert_eq!(file, (Ok("x.mp4".into()), Ok("x.mp4".into())));
+        let refused =
+            |(file, video): (Result<PathBuf, String>, _), word: &str| file == video && file.unwrap_err().contains(word);
+        assert!(refused(folder, "is a folder") && refused(no_folder, "no folder no/such"));
         assert!(parse_budget_ms("0").is_err() && parse_budget_ms("nan").is_err());
     }
 }

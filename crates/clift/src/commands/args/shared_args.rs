@@ -7,6 +7,7 @@ use clift_model::DeviceName;
 use clift_train::{Config, Override, TrainError, read_checked_config};
 use serde::Serialize;
 
+use crate::commands::args::parse::parse_output;
 use crate::exit_code::usage_bail;
 use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
@@ -48,27 +49,25 @@ pub fn read_config(
 pub struct JsonArg {
     /// Write the results as JSON
     // Another id than the field's, which arguments with this one flattened may have themselves.
-    #[arg(id = "json", long, value_name = "FILE")]
+    #[arg(id = "json", long, value_name = "FILE", value_parser = parse_output)]
     pub path: Option<PathBuf>,
 }
 
 impl JsonArg {
-    /// Checks that the folder of the file exists, before a command that takes minutes.
-    pub fn check_folder(&self) -> anyhow::Result<()> {
-        match self.path.as_deref().and_then(Path::parent) {
-            Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
-                usage_bail!("--json: no folder {}; create it first", folder.display())
-            }
-            _ => Ok(()),
-        }
-    }
-
     /// Writes the file, if one is given, and prints its path.
     pub fn write(&self, results: &impl Serialize) -> anyhow::Result<()> {
         let Some(path) = &self.path else { return Ok(()) };
         write_json(results, path)?;
         print_result(&format!("results: {}", path.display()))
     }
+}
+
+/// Refuses a path where something exists, unless it may be replaced.
+pub fn require_free(path: &Path, force: bool) -> anyhow::Result<()> {
+    if !force && path.exists() {
+        usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
+    }
+    Ok(())
 }
 
 /// Options of written scenes.

@@ -19,7 +19,6 @@ use crate::output::units::{memory_size, seconds};
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let config = timing.config.read(args.config.as_deref().unwrap_or(Path::new("")), |_| Ok(()))?;
-    timing.json.check_folder()?;
     let options = timing.options(BenchCase::ALL);
     let options = BenchOptions { error: !args.no_error, features: args.features.clone(), ..options };
     let stop = interrupt::flag()?;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 
-use crate::commands::args::parse::parse_distance;
+use crate::commands::args::parse::{parse_distance, parse_output};
 use crate::commands::args::splits::{SourceArgs, Splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
@@ -48,7 +48,7 @@ pub struct IndexArgs {
     #[command(flatten)]
     pub source: SourceArgs,
     /// Index file to write
-    #[arg(long, short, value_name = "FILE")]
+    #[arg(long, short, value_name = "FILE", value_parser = parse_output)]
     pub out: PathBuf,
     /// Use this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Test)]

@@ -6,6 +6,7 @@ use clift_bench::{DeviceCheck, Gradient, probe};
 use clift_eval::machine_rows;
 use clift_model::{DeviceName, InstructionSet, Precision};
 
+use crate::commands::args::parse::parse_output;
 use crate::commands::doctor::{adapters, stability};
 use crate::output::stdout::print_result;
 use crate::output::table::table;
@@ -157,7 +158,7 @@ pub struct DoctorArgs {
     #[arg(long, requires = "stability")]
     pub small: bool,
     /// Write the table of the cases as Markdown
-    #[arg(long, requires = "stability", value_name = "FILE")]
+    #[arg(long, requires = "stability", value_name = "FILE", value_parser = parse_output)]
     pub markdown: Option<PathBuf>,
 }
 

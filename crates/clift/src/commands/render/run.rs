@@ -14,6 +14,7 @@ use clift_model::{
 };
 use serde::Serialize;
 
+use crate::commands::args::shared_args::require_free;
 use crate::commands::render::args::{CameraPath, RenderArgs};
 use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
@@ -67,8 +68,8 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         print_warning(format!("the network was trained on images of {trained}; frames of {width} x {height} {effect}"));
     }
     frames::check_out(&args.out, args.force)?;
-    if let Some(video) = args.video.as_deref().filter(|video| !args.force && video.exists()) {
-        usage_bail!("the file {} exists; replace it with --force or choose another name", video.display());
+    if let Some(video) = &args.video {
+        require_free(video, args.force)?;
     }
     let views = path_cameras(&scene, args, height, width)?;
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;

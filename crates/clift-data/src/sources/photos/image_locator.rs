@@ -1,0 +1,115 @@
+//! Images named by a camera file, wherever they are.
+
+use std::path::{Component, Path, PathBuf};
+
+use crate::sources::photos::image_folder::ImageFolders;
+use crate::sources::photos::photo::{NO_IMAGE, PhotoOptions};
+
+/// Largest number of trailing parts of an image path that are searched in the scene folder.
+const MAX_SUFFIX_PARTS: usize = 32;
+
+/// Finds the images of a scene folder by the names in its camera file.
+pub(crate) struct ImageLocator<'a> {
+    folder: &'a Path,
+    options: &'a PhotoOptions,
+    folders: ImageFolders,
+}
+
+impl<'a> ImageLocator<'a> {
+    pub fn new(folder: &'a Path, options: &'a PhotoOptions) -> Self {
+        Self { folder, options, folders: ImageFolders::default() }
+    }
+
+    /// Returns the number of images in the searched folders that no name has found.
+    pub fn num_unrequested(&self) -> usize {
+        self.folders.num_unrequested()
+    }
+
+    /// Returns the path of an image, or why there is none. The name may have the separators of another system, belong to
+    /// another computer, or name an image of which only scaled copies exist.
+    pub fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
+        let found = self.find_at(Path::new(file_path));
+        if found.is_ok() || !file_path.contains('\\') {
+            return found;
+        }
+        // Separator of Windows; some tools mix both.
+        self.find_at(Path::new(&file_path.replace('\\', "/")))
+    }
+
+    fn find_at(&mut self, named: &Path) -> Result<PathBuf, String> {
+        if let Some(folder) = self.image_folder() {
+            let below =
+                if is_absolute(named) { self.longest_suffix(&folder, named) } else { without_first_folder(named) };
+            return self.folders.find(&folder.join(below));
+        }
+        let given = self.folder.join(named);
+        let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
+            return Err(NO_IMAGE.into());
+        };
+        if self.folders.has(parent) {
+            return self.folders.find(&given);
+        }
+        // Only scaled images exist, or the path belongs to another folder or computer.
+        let suffixes = path_suffixes(named).map(|suffix| self.folder.join(suffix));
+        for candidate in std::iter::once(given.clone()).chain(suffixes) {
+            let Some(parent) = candidate.parent().filter(|parent| *parent != self.folder) else { continue };
+            let last = parent.file_name().unwrap_or_default().to_string_lossy();
+            let scaled = ["", "_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
+            if let Some(folder) = scaled.into_iter().find(|folder| self.folders.has(folder)) {
+                return self.folders.find(&folder.join(name));
+            }
+        }
+        if is_absolute(named) {
+            return self.folders.find(&self.folder.join(name));
+        }
+        Err(NO_IMAGE.into())
+    }
+
+    /// Returns the configured image folder, or the first existing default folder.
+    fn image_folder(&mut self) -> Option<PathBuf> {
+        if let Some(folder) = &self.options.image_folder {
+            return Some(self.folder.join(folder));
+        }
+        let mut folders = self.options.first_folders.iter().map(|folder| self.folder.join(folder));
+        folders.find(|folder| self.folders.has(folder))
+    }
+
+    /// Returns the longest suffix of a path whose parent exists in `folder`.
+    fn longest_suffix(&mut self, folder: &Path, named: &Path) -> PathBuf {
+        let mut suffixes = path_suffixes(named);
+        let found =
+            suffixes.find(|suffix| suffix.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
+        found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
+    }
+}
+
+/// Returns the suffixes of a path, from the longest (at most [`MAX_SUFFIX_PARTS`] parts) to the file name.
+fn path_suffixes(path: &Path) -> impl Iterator<Item = PathBuf> {
+    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    (parts.len().saturating_sub(MAX_SUFFIX_PARTS)..parts.len()).map(move |start| parts[start..].iter().collect())
+}
+
+/// Returns whether a path is absolute, on Windows or on other systems.
+fn is_absolute(path: &Path) -> bool {
+    let first = path.components().next().map(|part| part.as_os_str().to_string_lossy());
+    path.has_root() || first.is_some_and(|first| first.len() == 2 && first.ends_with(':'))
+}
+
+/// Returns a path without its first folder: `left/1.png` for `images/left/1.png`.
+fn without_first_folder(path: &Path) -> PathBuf {
+    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    parts[parts.len().min(2).saturating_sub(1)..].iter().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_paths_give_bounded_suffixes() {
+        let suffixes = |path: &str| path_suffixes(Path::new(path)).collect::<Vec<_>>();
+        assert_eq!(suffixes("/a/./b/c.png"), ["a/b/c.png", "b/c.png", "c.png"].map(PathBuf::from));
+        let deep = suffixes(&"a/".repeat(2000));
+        assert_eq!((deep.len(), deep[0].components().count()), (MAX_SUFFIX_PARTS, MAX_SUFFIX_PARTS));
+    }
+}
