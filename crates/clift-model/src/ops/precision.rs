@@ -78,7 +78,7 @@ impl Precision {
     }
 
     /// Returns the precision in which pictures are rendered where none is named: bf16 if the device computes in it, f32
-    /// elsewhere. Pixels differ by less than half a grey level (root mean square), the PSNR by less than 0.01 dB.
+    /// elsewhere.
     pub fn for_pictures(device: &Device) -> Self {
         if missing_bf16(&device.clone().without_autodiff()).is_none() { Self::Bf16 } else { Self::F32 }
     }
