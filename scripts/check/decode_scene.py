@@ -1,4 +1,4 @@
-"""Decodes a scene file with coded tokens (version 3), as docs/reference/files.md describes it.
+"""Decodes a scene file with coded tokens (versions 3 and 4), as docs/reference/files.md describes it.
 
 usage: decode_scene.py SCENE.clift CODEC.safetensors [--write FILE | --check FILE]
 
@@ -14,6 +14,7 @@ import zlib
 import numpy as np
 
 TOTAL, MIN_ESCAPE, MAX_LEVEL = 1 << 16, 64, 1023
+LIMITS = [1, 2, 5, 13]
 
 
 def open_safetensors(path):
@@ -69,15 +70,28 @@ def level(decoder, levels, starts):
     return -(beyond + levels) if sign else beyond + levels
 
 
+def neighbours(ids, rows, columns):
+    """Returns class and the two nearest earlier tokens of the view of every token; the first of a view has itself."""
+    places, found = [(i // (rows * columns), i // columns % rows, i % columns) for i in ids], []
+    for token, (view, row, column) in enumerate(places):
+        others = [((r - row) ** 2 + (c - column) ** 2, -i) for i, (v, r, c) in enumerate(places[:token]) if v == view]
+        nearest = (sorted(others) * 2)[:2]
+        group = int(np.searchsorted(LIMITS, nearest[0][0])) if nearest else len(LIMITS) + 1
+        found.append((group, [-other for _, other in nearest] or [token, token]))
+    return found
+
+
 def decode(scene_path, codec_path):
     data, fields, scene = open_safetensors(scene_path)
     _, info, codec = open_safetensors(codec_path)
-    assert fields["version"] == "3" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
+    assert fields["version"] in "34" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
     body, views, count = scene["scene"].tobytes(), int(fields["views"]), int(fields["tokens"])
     patch = json.loads(info["model"])["patch_size"]
     patches = views * (int(fields["height"]) // patch) * (int(fields["width"]) // patch)
     step = float(np.frombuffer(body[:4], "<f4")[0])
-    decoder = Decoder(np.frombuffer(body[4 + 13 * 8 + views * 68 : -4], "<u4").tolist())
+    start = 4 + 13 * 8
+    start += views * 68 if fields["version"] == "3" else 4 + 16 * struct.unpack_from("<I", body, start)[0] + views * 32
+    decoder = Decoder(np.frombuffer(body[start:-4], "<u4").tolist())
     ids = []
     for index in range(patches):
         left, rest = count - len(ids), patches - index
@@ -85,10 +99,18 @@ def decode(scene_path, codec_path):
         if left == rest or (left > 0 and decoder.next([0, size, TOTAL]) == 0):
             ids.append(index)
     knots, deviations = codec["knots"].astype(float), codec["deviations"].astype(float)
-    levels = np.zeros((count, len(deviations)))
+    levels, groups = np.zeros((count, len(deviations))), len(LIMITS) + 2
+    weights = codec.get("weights", np.zeros((groups, len(deviations), 2))).astype(float)
+    scales = codec.get("scales", np.ones((groups, len(deviations)))).astype(float)
+    near = neighbours(ids, int(fields["height"]) // patch, int(fields["width"]) // patch)
     for direction, deviation in enumerate(deviations):
-        symbols = table(knots, codec["cumulative"][direction].astype(float), step / deviation)
-        levels[:, direction] = [level(decoder, *symbols) for _ in range(count)]
+        ratio, reach = step / deviation, np.abs(weights[:, direction]).sum(1)
+        spreads = np.sqrt(scales[:, direction] * scales[:, direction] + reach * reach * min(ratio * ratio / 12.0, 1.0))
+        tables = [table(knots, codec["cumulative"][direction].astype(float), ratio / spread) for spread in spreads]
+        for token, (group, nearest) in enumerate(near):
+            products = weights[group, direction] * levels[nearest, direction]
+            expected = np.floor(products[0] + products[1] + 0.5)
+            levels[token, direction] = expected + level(decoder, *tables[group])
     assert decoder.state == 0 and not decoder.words, "words are left"
     return ids, levels * step @ codec["basis"].astype(float) + codec["mean"]
 

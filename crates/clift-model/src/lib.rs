@@ -110,6 +110,7 @@ pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::trained_model::TrainedModel;
 // The coder of tokens in scene files
 pub use codec::histogram::{Distributions, Histograms};
+pub use codec::prediction::{NeighbourProducts, Places, Prediction};
 pub use codec::rates::RateTable;
 pub use codec::token_codec::{LevelCounts, TokenCodec};
 pub use codec::transform::{Moments, Transform};

@@ -1,8 +1,8 @@
 //! The rows of the token coder, which runs on the host.
 
 use burn::tensor::Device;
-use clift_data::step_rng;
-use clift_model::{Histograms, RateTable, TokenCodec, TokenKind, Transform};
+use clift_data::{DataConfig, step_rng};
+use clift_model::{Histograms, NeighbourProducts, Places, RateTable, TokenCodec, TokenKind, Transform};
 use clift_train::TrainError;
 use rand::RngExt;
 
@@ -19,7 +19,7 @@ pub struct CodingCase {
     codec: TokenCodec,
     tokens: Vec<f32>,
     ids: Vec<u32>,
-    num_patches: usize,
+    grid: [usize; 3],
     /// The coded tokens; `None` for the row that codes.
     words: Option<Vec<u32>>,
 }
@@ -43,8 +43,16 @@ impl CodingCase {
             .collect();
         let basis = (0..dim * dim).map(|i| f32::from(u8::from(i % dim == i / dim))).collect();
         let transform = Transform { mean: vec![0.0; dim], basis, deviations };
+        let DataConfig { width, height, views, .. } = &context.config.data;
+        let [rows, columns] = [*height, *width].map(|side| side / context.config.model.patch_size);
+        let grid = [views.min_context, rows, columns];
+        let ids: Vec<u32> = (0..count).map(|i| (i * num_patches / count) as u32).collect();
+        let places = Places { ids: &ids, grid };
+        let mut products = NeighbourProducts::new(dim);
+        products.add(&transform, &tokens, places);
+        let prediction = products.prediction(&transform);
         let mut histograms = Histograms::new(dim);
-        histograms.add(&transform, &tokens);
+        histograms.add(&transform, &prediction, &tokens, places);
         let rates = RateTable {
             shares: vec![1.0],
             steps: vec![1.0, 2.0],
@@ -53,19 +61,21 @@ impl CodingCase {
             psnr: vec![20.0],
         };
         let network = (context.config.model.clone(), TokenKind::Clift, String::new());
-        let codec = TokenCodec::new(network, transform, histograms.distributions(), rates)?;
-        let ids: Vec<u32> = (0..count).map(|i| (i * num_patches / count) as u32).collect();
-        let words = is_decoder.then(|| codec.encode(&tokens, &ids, num_patches, STEP)).transpose()?;
-        Ok(Self { codec, tokens, ids, num_patches, words })
+        let codec = TokenCodec::new(network, (transform, prediction), histograms.distributions(), rates)?;
+        let words = is_decoder.then(|| codec.encode(&tokens, places, STEP)).transpose()?;
+        Ok(Self { codec, tokens, ids, grid, words })
     }
 }
 
 impl BenchTask for CodingCase {
     fn run(&mut self) -> Result<(), TrainError> {
         match &self.words {
-            None => drop(self.codec.encode(&self.tokens, &self.ids, self.num_patches, STEP)?),
+            None => {
+                let places = Places { ids: &self.ids, grid: self.grid };
+                drop(self.codec.encode(&self.tokens, places, STEP)?);
+            }
             Some(words) => {
-                let decoded = self.codec.decode(words.clone(), self.ids.len(), self.num_patches, STEP);
+                let decoded = self.codec.decode(words.clone(), self.ids.len(), self.grid, STEP);
                 drop(decoded.expect("words of this codec"));
             }
         }

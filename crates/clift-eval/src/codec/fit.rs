@@ -1,5 +1,6 @@
 //! Fits the token codec of a model on training scenes: the transform on second moments and on how much renderings change
-//! with every direction, the distributions in a second pass, then bits and loss of every count and step on renderings.
+//! with every direction, the prediction and the distributions in further passes, then bits and loss of every count and step on
+//! renderings.
 // N encoder tokens, S stored tokens, D width
 
 use std::ops::Range;
@@ -7,8 +8,8 @@ use std::ops::Range;
 use burn::tensor::Tensor;
 use clift_data::{Clip, ClipReader, EvaluationItem, derive_seed, item_rng, mean};
 use clift_model::{
-    Cameras, Histograms, KMeans, LevelCounts, Moments, RateTable, TokenCodec, TokenCount, TokenKind, Tokens,
-    TrainedModel, Transform,
+    Cameras, Histograms, KMeans, LevelCounts, Moments, NeighbourProducts, Places, RateTable, TokenCodec, TokenCount,
+    TokenKind, Tokens, TrainedModel, Transform,
 };
 use rand::RngExt;
 
@@ -17,7 +18,7 @@ use crate::evaluator::progress::Progress;
 use crate::sweep::compressed_tokens::with_values;
 use crate::upload::{host_values, upload_cameras, upload_views};
 
-/// Most scenes that transform and distributions are fitted on; each is read twice, with one of the counts.
+/// Most scenes that transform and distributions are fitted on; each is read three times, with one of the counts.
 const MAX_FITTED_SCENES: usize = 64;
 /// Most scenes whose renderings are measured, with every count and step.
 const MAX_MEASURED_SCENES: usize = 8;
@@ -70,7 +71,7 @@ pub fn fit_codec(
 ) -> Result<FittedCodec, EvalError> {
     let num_fitted = items.len().min(MAX_FITTED_SCENES);
     let measured = &items[..items.len().min(MAX_MEASURED_SCENES)];
-    let total = 2 * (num_fitted + measured.len());
+    let total = 3 * num_fitted + 2 * measured.len();
     let mut fit = Fit { model, reader, options, progress, done: 0, total };
     fit.progress.done(0, total);
 
@@ -78,7 +79,7 @@ pub fn fit_codec(
     let mut num_scenes = 0;
     for (i, item) in items[..num_fitted].iter().enumerate() {
         if let Some(clip) = fit.read(item)? {
-            moments.add(&fit.tokens(&clip, i)?);
+            moments.add(&fit.tokens(&clip, i)?.0);
             num_scenes += 1;
         }
     }
@@ -93,10 +94,19 @@ pub fn fit_codec(
         }
     }
     transform.weigh(&direction_weights(model.config.dim, &effects));
+    let mut products = NeighbourProducts::new(model.config.dim);
+    for (i, item) in items[..num_fitted].iter().enumerate() {
+        if let Some(clip) = fit.read(item)? {
+            let (tokens, ids) = fit.tokens(&clip, i)?;
+            products.add(&transform, &tokens, fit.places(&ids, &clip));
+        }
+    }
+    let prediction = products.prediction(&transform);
     let mut histograms = Histograms::new(model.config.dim);
     for (i, item) in items[..num_fitted].iter().enumerate() {
         if let Some(clip) = fit.read(item)? {
-            histograms.add(&transform, &fit.tokens(&clip, i)?);
+            let (tokens, ids) = fit.tokens(&clip, i)?;
+            histograms.add(&transform, &prediction, &tokens, fit.places(&ids, &clip));
         }
     }
     let deviation = mean_variance(&transform).sqrt();
@@ -111,7 +121,7 @@ pub fn fit_codec(
         loss: vec![0.0; steps.len()],
         psnr: vec![0.0],
     };
-    let codec = TokenCodec::new(network.clone(), transform, histograms.distributions(), unknown)?;
+    let codec = TokenCodec::new(network.clone(), (transform, prediction), histograms.distributions(), unknown)?;
     let mut rates = Measured::new(options.counts.len(), steps);
     for item in measured {
         if let Some(clip) = fit.read(item)? {
@@ -119,7 +129,7 @@ pub fn fit_codec(
         }
     }
     let table = rates.table()?;
-    let codec = TokenCodec::new(network, codec.transform, codec.distributions, table)?;
+    let codec = TokenCodec::new(network, (codec.transform, codec.prediction), codec.distributions, table)?;
     let Measured { stream_bits, levels, num_values, .. } = rates;
     let entropies = levels.iter().map(LevelCounts::entropy_bits);
     let stream_and_entropy_bits = stream_bits.into_iter().zip(entropies).map(<[f64; 2]>::from).collect();
@@ -150,26 +160,34 @@ impl Fit<'_> {
         Ok(clip.ok())
     }
 
-    /// Returns the stored tokens of a scene, `[S, D]`, at one of the counts.
-    fn tokens(&self, clip: &Clip, index: usize) -> Result<Vec<f32>, EvalError> {
+    /// Returns the stored tokens of a scene, `[S, D]`, at one of the counts, and their patches.
+    fn tokens(&self, clip: &Clip, index: usize) -> Result<(Vec<f32>, Vec<u32>), EvalError> {
         let lift = self.model.network.encode(&upload_views(&[&clip.context], &self.model.device)?);
         let count = self.options.counts[index % self.options.counts.len()];
-        host_values(&self.stored(&lift, count, clip)?)
+        let (tokens, ids) = self.stored(&lift, count, clip)?;
+        Ok((host_values(&tokens)?, ids))
     }
 
-    /// Clusters and condenses encoder tokens `[1, N, D]`.
-    fn stored(&self, lift: &Tokens, count: TokenCount, clip: &Clip) -> Result<Tokens, EvalError> {
+    fn places<'a>(&self, ids: &'a [u32], clip: &Clip) -> Places<'a> {
+        let [rows, columns] = [clip.context.height, clip.context.width].map(|side| side / self.model.config.patch_size);
+        Places { ids, grid: [clip.context.num_views(), rows, columns] }
+    }
+
+    /// Clusters and condenses encoder tokens `[1, N, D]`; returns the tokens and their patches.
+    fn stored(&self, lift: &Tokens, count: TokenCount, clip: &Clip) -> Result<(Tokens, Vec<u32>), EvalError> {
         let [_, num_tokens, _] = lift.dims();
         let seed = derive_seed(self.options.seed, &clip.key);
         // A scene of fewer tokens stores all of them.
         let count = count.of(num_tokens).unwrap_or(num_tokens);
         let fit = self.options.kmeans.fit(lift.values.clone(), count, &[seed])?;
+        let ids = fit.clusters.scenes()[0].centroid_index().to_vec();
         let clusters = fit.clusters.upload(&self.model.device);
-        Ok(if self.model.has_condenser {
+        let tokens = if self.model.has_condenser {
             self.model.network.compress(lift.clone(), &clusters)
         } else {
             lift.centroids(&clusters)
-        })
+        };
+        Ok((tokens, ids))
     }
 
     /// Renders the targets of a clip, `[V, height, width, 3]`.
@@ -189,7 +207,7 @@ impl Fit<'_> {
         let device = &self.model.device;
         let lift = self.model.network.encode(&upload_views(&[&clip.context], device)?);
         let cameras = upload_cameras(&[&clip.target], device)?;
-        let tokens = self.stored(&lift, self.options.counts[index % self.options.counts.len()], clip)?;
+        let (tokens, _) = self.stored(&lift, self.options.counts[index % self.options.counts.len()], clip)?;
         let (values, exact) = (host_values(&tokens)?, self.render(tokens.clone(), &cameras)?);
         let dim = transform.mean.len();
         let mut rng = item_rng(self.options.seed, index as u64, 0, 0, "codec noise");
@@ -218,7 +236,8 @@ impl Fit<'_> {
         let render = |tokens: Tokens| self.render(tokens, &cameras);
         let view_len = truth.len() / clip.target.num_views();
         for (c, &count) in self.options.counts.iter().enumerate() {
-            let tokens = self.stored(&lift, count, clip)?;
+            let (tokens, ids) = self.stored(&lift, count, clip)?;
+            let places = self.places(&ids, clip);
             let values = host_values(&tokens)?;
             let (num_tokens, exact) = (tokens.dims()[1], render(tokens.clone())?);
             let errors = view_errors(&exact, &truth, view_len);
@@ -227,8 +246,8 @@ impl Fit<'_> {
             rates.psnr[c].push(mean(&psnr).unwrap_or_default());
             for k in 0..rates.steps.len() {
                 let step = rates.steps[k] as f32;
-                let bits = codec.count_bits(&values, step, &mut rates.levels[k])?;
-                let rounded = render(with_values(tokens.clone(), codec.round(&values, step)?))?;
+                let bits = codec.count_bits(&values, places, step, &mut rates.levels[k])?;
+                let rounded = render(with_values(tokens.clone(), codec.round(&values, places, step)?))?;
                 rates.loss[c][k].push(loss(&exact, &rounded, &errors));
                 rates.bits[c][k].push(bits / num_tokens as f64);
                 rates.stream_bits[k] += bits;

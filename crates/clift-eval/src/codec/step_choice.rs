@@ -37,7 +37,7 @@ pub fn step_for_loss(
     let exact: Vec<f32> = render_scene(model, scene, &views.cameras, views.size)?.concat();
     let errors = view_errors(&exact, &views.truth, views.truth.len() / views.cameras.len());
     let measured = |step: f32| -> Result<f64, EvalError> {
-        let rounded = Scene { tokens: codec.round(&scene.tokens, step)?, ..scene.clone() };
+        let rounded = Scene { tokens: scene.rounded_tokens(codec, step)?, ..scene.clone() };
         let rounded = render_scene(model, &rounded, &views.cameras, views.size)?.concat();
         Ok(loss(&exact, &rounded, &errors))
     };

@@ -60,7 +60,7 @@ impl<'a> CompressedTokens<'a> {
                 let step = codec.rates.step_for_loss(share, loss.db()) as f32;
                 let scene = scene_of(clip, codec, &ids, host_values(&tokens)?, model_path);
                 let bytes = scene.coded_bytes(codec, step)?.len() as u64;
-                (with_values(tokens, codec.round(&scene.tokens, step)?), bytes)
+                (with_values(tokens, scene.rounded_tokens(codec, step)?), bytes)
             }
         };
         Ok(Self { tokens, ids, model, file_bytes: Some(bytes) })

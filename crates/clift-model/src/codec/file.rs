@@ -8,6 +8,7 @@ use safetensors::{SafeTensors, serialize};
 use sha2::{Digest, Sha256};
 
 use crate::codec::histogram::Distributions;
+use crate::codec::prediction::{NUM_CLASSES, Prediction};
 use crate::codec::rates::RateTable;
 use crate::codec::token_codec::TokenCodec;
 use crate::codec::transform::Transform;
@@ -20,7 +21,8 @@ use crate::weights::file::sorted_header;
 use crate::weights::tensors::Tensors;
 
 const FORMAT: &str = "clift-codec";
-const VERSION: &str = "1";
+/// Without and with prediction.
+const VERSIONS: [&str; 2] = ["1", "2"];
 /// Largest accepted file: a codec of width 4,096 takes a tenth of it.
 const MAX_FILE_BYTES: u64 = 1 << 30;
 
@@ -31,12 +33,20 @@ impl TokenCodec {
     /// [`ModelError::BadConfig`] for a codec that cannot be stored.
     pub fn new(
         (model, kind, renderer_hash): (ModelConfig, TokenKind, String),
-        transform: Transform,
+        (transform, prediction): (Transform, Prediction),
         distributions: Distributions,
         rates: RateTable,
     ) -> Result<Self, ModelError> {
-        let mut codec =
-            Self { model, kind, renderer_hash, transform, distributions, rates: rates.new()?, hash: String::new() };
+        let mut codec = Self {
+            model,
+            kind,
+            renderer_hash,
+            transform,
+            prediction,
+            distributions,
+            rates: rates.new()?,
+            hash: String::new(),
+        };
         codec.hash = hash_of(&codec)?;
         Ok(codec)
     }
@@ -91,12 +101,12 @@ fn hash(bytes: &[u8]) -> String {
 }
 
 fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
-    let TokenCodec { model, kind, renderer_hash, transform, distributions, rates, .. } = codec;
+    let TokenCodec { model, kind, renderer_hash, transform, prediction, distributions, rates, .. } = codec;
     let (dim, knots) = (transform.mean.len(), distributions.knots.len());
     let (counts, steps) = (rates.shares.len(), rates.steps.len());
     let f32s = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
     let f64s = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
-    let tensors = [
+    let mut tensors = vec![
         ("mean", Dtype::F32, vec![dim], f32s(&transform.mean)),
         ("basis", Dtype::F32, vec![dim, dim], f32s(&transform.basis)),
         ("deviations", Dtype::F32, vec![dim], f32s(&transform.deviations)),
@@ -108,13 +118,18 @@ fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
         ("rate_loss", Dtype::F64, vec![counts, steps], f64s(&rates.loss)),
         ("rate_psnr", Dtype::F64, vec![counts], f64s(&rates.psnr)),
     ];
+    let has_prediction = *prediction != Prediction::none(dim);
+    if has_prediction {
+        tensors.push(("weights", Dtype::F32, vec![NUM_CLASSES, dim, 2], f32s(&prediction.weights)));
+        tensors.push(("scales", Dtype::F32, vec![NUM_CLASSES, dim], f32s(&prediction.scales)));
+    }
     let views: Result<Vec<_>, _> = tensors
         .iter()
         .map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)))
         .collect();
     let metadata = HashMap::from([
         ("format".to_owned(), FORMAT.to_owned()),
-        ("version".to_owned(), VERSION.to_owned()),
+        ("version".to_owned(), VERSIONS[usize::from(has_prediction)].to_owned()),
         ("kind".to_owned(), kind.name().to_owned()),
         ("model".to_owned(), serde_json::to_string(model).map_err(|error| error.to_string())?),
         ("renderer".to_owned(), renderer_hash.clone()),
@@ -129,11 +144,12 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     let file = SafeTensors::deserialize(bytes).map_err(text)?;
     let metadata = header.metadata().clone().unwrap_or_default();
     let field = |name: &str| metadata.get(name).ok_or_else(|| format!("no `{name}` in the header"));
-    for (name, expected) in [("format", FORMAT), ("version", VERSION)] {
-        let found = field(name)?;
-        if found != expected {
-            return Err(format!("{name} {found:?}, expected {expected:?}"));
-        }
+    let [format, version] = [field("format")?, field("version")?];
+    if format != FORMAT {
+        return Err(format!("format {format:?}, expected {FORMAT:?}"));
+    }
+    if !VERSIONS.contains(&version.as_str()) {
+        return Err(format!("version {version:?}, expected {}", VERSIONS.join(" or ")));
     }
     let model: ModelConfig =
         serde_json::from_str(field("model")?).map_err(|error| format!("unreadable `model` ({error})"))?;
@@ -158,6 +174,16 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     };
     let distributions =
         Distributions { knots: f32s("knots", &[knots])?, cumulative: f32s("cumulative", &[dim, knots])? };
+    let prediction = match version.as_str() {
+        "1" => Prediction::none(dim),
+        _ => Prediction {
+            weights: f32s("weights", &[NUM_CLASSES, dim, 2])?,
+            scales: f32s("scales", &[NUM_CLASSES, dim])?,
+        },
+    };
+    if let Some(scale) = prediction.scales.iter().find(|scale| **scale <= 0.0) {
+        return Err(format!("scale {scale}, expected a positive number"));
+    }
     check_transform(&transform)?;
     check_distributions(&distributions)?;
     let rates = RateTable {
@@ -169,7 +195,7 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     };
     let rates = rates.new().map_err(|error| error.to_string())?;
     let renderer_hash = field("renderer")?.clone();
-    Ok(TokenCodec { model, kind, renderer_hash, transform, distributions, rates, hash: hash(bytes) })
+    Ok(TokenCodec { model, kind, renderer_hash, transform, prediction, distributions, rates, hash: hash(bytes) })
 }
 
 fn check_transform(transform: &Transform) -> Result<(), String> {

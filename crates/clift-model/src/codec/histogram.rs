@@ -1,6 +1,7 @@
-//! The distribution of every coefficient, in units of its standard deviation.
+//! The distribution of every coefficient around its expected value, in units of its standard deviation there.
 // D width, K knots
 
+use crate::codec::prediction::{Places, Prediction};
 use crate::codec::transform::Transform;
 
 /// Knots of one sign: from 1/32 to 32 standard deviations, four per octave.
@@ -35,12 +36,17 @@ impl Histograms {
     }
 
     /// Adds the tokens of a scene, `[S, D]`. Values beyond the last knots count in the last bins.
-    pub fn add(&mut self, transform: &Transform, tokens: &[f32]) {
+    pub fn add(&mut self, transform: &Transform, prediction: &Prediction, tokens: &[f32], places: Places<'_>) {
         let (dim, bins) = (transform.mean.len(), self.knots.len() - 1);
         let weight = dim as f64 / tokens.len() as f64;
-        for row in transform.forward(tokens).chunks_exact(dim) {
-            for (d, (value, deviation)) in row.iter().zip(&transform.deviations).enumerate() {
-                let above = self.knots.partition_point(|knot| *knot <= value / deviation);
+        let (values, neighbours) = places.sorted(&transform.forward(tokens), dim);
+        for (token, (class, nearest)) in neighbours.iter().enumerate() {
+            for (d, &deviation) in transform.deviations.iter().enumerate() {
+                let [first, second] = nearest.map(|token| f64::from(values[token * dim + d]));
+                let expected = prediction.value(class, d, [first, second]);
+                let scale = f64::from(deviation) * prediction.deviation(class, d, 0.0);
+                let value = (f64::from(values[token * dim + d]) - expected) / scale;
+                let above = self.knots.partition_point(|knot| f64::from(*knot) <= value);
                 self.weights[d * bins + above.clamp(1, bins) - 1] += weight;
             }
         }

@@ -18,7 +18,7 @@ pub(crate) const MIN_BITS: f64 = 1.4e-3;
 const MAX_ESCAPE_BITS: u32 = 30;
 
 /// Symbols of a direction: the levels `-levels..=levels`, then the escape.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Table {
     levels: i32,
     /// First quantile of every symbol, and [`TOTAL`].

@@ -11,7 +11,9 @@ use crate::network::config::ModelConfig;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
-use crate::scene::scene::{CODED_VERSION, FORMAT, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name};
+use crate::scene::scene::{
+    CODED_VERSION, FORMAT, FORMER_CODED_VERSION, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name,
+};
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
 use crate::views::camera::ViewCamera;
@@ -83,12 +85,12 @@ fn from_bytes(
         return Err(refusal("the file is no scene: its header lacks the scene format", GIVE_ANOTHER));
     }
     let version = fields.get("version")?;
-    if version == CODED_VERSION {
+    if [CODED_VERSION, FORMER_CODED_VERSION].contains(&version) {
         let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
         return from_coded_bytes(bytes, body, &fields, find_codec);
     }
     if ![VERSION, FORMER_VERSION].contains(&version) {
-        let reason = format!("scene file version {version:?}, expected \"1\", {VERSION:?} or {CODED_VERSION:?}");
+        let reason = format!("scene file version {version:?}, expected \"1\" to {CODED_VERSION:?}");
         return Err(refusal(reason, OTHER_VERSION));
     }
     let kind = fields.get("kind")?;

@@ -271,7 +271,7 @@ impl Coding {
         };
         encoded.sort_tokens()?;
         encoded.scene.write_coded(&args.out, &codec, step)?;
-        encoded.scene.tokens = codec.round(&encoded.scene.tokens, step)?;
+        encoded.scene.tokens = encoded.scene.rounded_tokens(&codec, step)?;
         Ok(format!("coded, {note}"))
     }
 }

@@ -5,6 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::*;
 use crate::codec::histogram::Histograms;
+use crate::codec::prediction::NeighbourProducts;
 use crate::codec::rates::tests::rates;
 use crate::codec::transform::Moments;
 
@@ -34,11 +35,19 @@ pub(crate) fn codec(model: ModelConfig, kind: TokenKind, renderer_hash: String) 
         moments.add(scene);
     }
     let transform = moments.transform();
+    let ids = ids(256);
+    let places = places(&ids);
+    let mut products = NeighbourProducts::new(dim);
+    for scene in &scenes {
+        products.add(&transform, scene, places);
+    }
+    let prediction = products.prediction(&transform);
     let mut histograms = Histograms::new(dim);
     for scene in &scenes {
-        histograms.add(&transform, scene);
+        histograms.add(&transform, &prediction, scene, places);
     }
-    TokenCodec::new((model, kind, renderer_hash), transform, histograms.distributions(), rates()).expect("valid")
+    let network = (model, kind, renderer_hash);
+    TokenCodec::new(network, (transform, prediction), histograms.distributions(), rates()).expect("valid")
 }
 
 fn small() -> TokenCodec {
@@ -50,13 +59,22 @@ fn ids(count: usize) -> Vec<u32> {
     (0..count as u32).map(|id| 3 * id).collect()
 }
 
+/// Every third patch of views of 6 x 10.
+fn places(ids: &[u32]) -> Places<'_> {
+    Places { ids, grid: grid(ids.len()) }
+}
+
+fn grid(count: usize) -> [usize; 3] {
+    [(3 * count).div_ceil(60), 6, 10]
+}
+
 #[test]
 fn streams_take_the_bits_of_their_entropy() {
     let codec = small();
-    let unseen = tokens(4000, DIM, 99);
+    let unseen = tokens(32_000, DIM, 99);
     for step in [0.2, 1.0, 4.0] {
         let mut counts = LevelCounts::default();
-        let stream = codec.count_bits(&unseen, step, &mut counts).unwrap();
+        let stream = codec.count_bits(&unseen, places(&ids(32_000)), step, &mut counts).unwrap();
         let entropy = counts.entropy_bits();
         assert!(stream < 1.02 * entropy + 64.0, "step {step}: {stream} bits, entropy {entropy}");
         assert!(stream > 0.99 * entropy, "step {step}: {stream} bits, entropy {entropy}");
@@ -69,9 +87,9 @@ fn tokens_come_back_as_rounded() {
     let unseen = tokens(40, DIM, 7);
     let mut last = f32::INFINITY;
     for step in [4.0, 0.5, 0.01, 1e-4] {
-        let words = codec.encode(&unseen, &ids(40), 120, step).unwrap();
-        let rounded = codec.round(&unseen, step).unwrap();
-        let back = codec.decode(words, 40, 120, step).unwrap();
+        let words = codec.encode(&unseen, places(&ids(40)), step).unwrap();
+        let rounded = codec.round(&unseen, places(&ids(40)), step).unwrap();
+        let back = codec.decode(words, 40, grid(40), step).unwrap();
         assert_eq!(back, (ids(40), rounded.clone()));
         // A level is at most one step from its coefficient, and the basis is orthonormal.
         let error = rounded.iter().zip(&unseen).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
@@ -85,22 +103,24 @@ fn tokens_come_back_as_rounded() {
 fn tokens_unlike_all_training_tokens_are_coded() {
     let codec = small();
     let far: Vec<f32> = (0..4 * DIM).map(|i| if i == 5 { 1e6 } else { -3e4 }).collect();
-    let words = codec.encode(&far, &ids(4), 12, 0.5).unwrap();
-    let (_, back) = codec.decode(words, 4, 12, 0.5).unwrap();
+    let words = codec.encode(&far, places(&ids(4)), 0.5).unwrap();
+    let (_, back) = codec.decode(words, 4, grid(4), 0.5).unwrap();
     assert!(back.iter().zip(&far).all(|(a, b)| (a - b).abs() < 3.0), "{back:?}");
     for (step, expected) in [(1e-6, "write a larger step, or f32"), (0.0, "write a positive"), (f32::NAN, "positive")] {
-        let message = codec.round(&far, step).unwrap_err().to_string();
+        let message = codec.round(&far, places(&ids(4)), step).unwrap_err().to_string();
         assert!(message.contains(expected), "{message}");
     }
-    let message = codec.round(&[f32::MAX; DIM], 1.0).unwrap_err().to_string();
+    let message = codec.round(&[f32::MAX; DIM], places(&[0]), 1.0).unwrap_err().to_string();
     assert!(message.contains("write a larger step, or f32"), "{message}");
 }
 
 #[test]
 fn hostile_words_are_refused_in_bounded_memory() {
     let codec = small();
-    let words = codec.encode(&tokens(40, DIM, 7), &ids(40), 120, 0.5).unwrap();
-    let refuse = |words: &[u32], count, patches, step| codec.decode(words.to_vec(), count, patches, step).unwrap_err();
+    let words = codec.encode(&tokens(40, DIM, 7), places(&ids(40)), 0.5).unwrap();
+    let refuse = |words: &[u32], count, patches: usize, step| {
+        codec.decode(words.to_vec(), count, [1, 1, patches], step).unwrap_err()
+    };
     assert!(refuse(&words, 0, 120, 0.5).contains("0 tokens, expected 1 to 120"));
     assert!(refuse(&words, 121, 120, 0.5).contains("121 tokens"));
     assert!(refuse(&words, 1 << 20, 1 << 20, 0.5).contains("expected at most"));
@@ -114,7 +134,7 @@ fn hostile_words_are_refused_in_bounded_memory() {
     for _ in 0..200 {
         let random: Vec<u32> = (0..40).map(|_| rng.next_u32() | 1).collect();
         for step in [1e-30, 1e-3, 1.0, 1e30] {
-            let _ = codec.decode(random.clone(), 40, 120, step);
+            let _ = codec.decode(random.clone(), 40, grid(40), step);
         }
     }
 }
@@ -140,7 +160,7 @@ fn codecs_survive_their_file_and_damage_is_found() {
     for (bytes, expected) in [
         (bytes[..bytes.len() - 1].to_vec(), "reading the token codec failed"),
         (text("clift-codec", "clift-scene"), "format \"clift-scene\", expected"),
-        (text("\"version\":\"1\"", "\"version\":\"2\""), "version \"2\", expected"),
+        (text("\"version\":\"2\"", "\"version\":\"3\""), "version \"3\", expected 1 or 2"),
         (text("\\\"dim\\\":8", "\\\"dim\\\":4"), "`mean` is F32 [8], expected F32 [4]"),
         (text("rate_psnr", "rate_psnt"), "no tensor `rate_psnr`"),
         (b"{}".to_vec(), "fit it again with `clift codec`"),
@@ -161,5 +181,6 @@ fn codecs_survive_their_file_and_damage_is_found() {
     damaged(&|codec| codec.transform.mean[0] = f32::NAN, "`mean` contains NaN");
     damaged(&|codec| codec.distributions.knots[1] = 90.0, "the knots are no ascending numbers");
     damaged(&|codec| codec.distributions.cumulative[7] = 0.9, "the probabilities of direction 0");
+    damaged(&|codec| codec.prediction.scales[0] = 0.0, "scale 0, expected a positive number");
     damaged(&|codec| codec.rates.steps[0] = 9.0, "`rates` =");
 }

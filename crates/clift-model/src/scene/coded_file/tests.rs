@@ -7,6 +7,7 @@ use safetensors::SafeTensors;
 use super::*;
 use crate::codec::token_codec::tests::codec;
 use crate::scene::scene::tests::{scene, with_header};
+use crate::views::camera::ViewCamera;
 
 const STEP: f32 = 0.25;
 
@@ -67,7 +68,7 @@ fn coded_scenes_come_back_ordered_and_rounded() {
     let original = scene();
     assert_eq!(back.token_ids, [0, 3, 7, 8, 11]);
     let dim = original.model.dim;
-    let expected = folder.1.round(&original.tokens, STEP).unwrap();
+    let expected = original.rounded_tokens(&folder.1, STEP).unwrap();
     for (new, old) in [0, 2, 3, 4, 1].into_iter().enumerate() {
         assert_eq!(back.tokens[new * dim..][..dim], expected[old * dim..][..dim], "token {new}");
     }
@@ -75,11 +76,7 @@ fn coded_scenes_come_back_ordered_and_rounded() {
         (&back.key, &back.model, &back.renderer_hash),
         (&original.key, &original.model, &original.renderer_hash)
     );
-    assert_eq!((back.world, &back.context_frames), (original.world, &original.context_frames));
-    for (got, expected) in back.context.iter().zip(&original.context) {
-        let values = |camera: &ViewCamera| [&camera.c2w[..], &camera.intrinsics].concat();
-        assert!(values(got).iter().zip(values(expected)).all(|(a, b)| (a - b).abs() < 1e-6), "{got:?}");
-    }
+    assert_same_views(&back, &original);
     // Another model is given, or none is found.
     let moved = folder.0.path().join("elsewhere");
     std::fs::rename(folder.0.path().join("runs"), &moved).unwrap();
@@ -126,7 +123,7 @@ fn hostile_files_with_valid_checksums_are_refused() {
         (hash.as_str(), "0123456789abcdef", "the scene was coded with the codec 0123456789abcdef"),
         ("\"codec\"", "\"coder\"", "no `codec` in the header"),
         ("\"scene\":{", "\"scenf\":{", "no tensor `scene`"),
-        ("\"version\":\"3\"", "\"version\":\"4\"", "version \"4\", expected \"1\", \"2\" or \"3\""),
+        ("\"version\":\"4\"", "\"version\":\"5\"", "version \"5\", expected \"1\" to \"4\""),
     ] {
         let message = folder.refusal_of(&checked(with_header(&bytes, &[(from, to)])));
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
@@ -143,8 +140,9 @@ fn hostile_files_with_valid_checksums_are_refused() {
         (0, &(-1.0_f32).to_le_bytes(), "step -1"),
         (4, &f64::NAN.to_le_bytes(), "mean pose: the pose contains NaN"),
         (4 + 96, &(-1.0_f64).to_le_bytes(), "pose scale -1"),
-        (4 + 104, &9.0_f32.to_le_bytes(), "context camera 0: the rotation differs"),
-        (4 + 104 + 48, &(-1.0_f32).to_le_bytes(), "context camera 0: intrinsics [-1.0"),
+        (4 + 104, &3_u32.to_le_bytes(), "views and coded tokens"),
+        (4 + 104 + 4, &(-1.0_f32).to_le_bytes(), "context camera 0: intrinsics [-1.0"),
+        (4 + 104 + 4 + 16, &f32::NAN.to_le_bytes(), "context camera 0: the pose contains NaN"),
     ] {
         let mut damaged = bytes.clone();
         damaged[start + at..][..value.len()].copy_from_slice(value);
@@ -163,23 +161,52 @@ fn codecs_of_other_models_are_refused() {
 }
 
 /// `CLIFT_UPDATE=1` writes scene and codec again; then `scripts/check/decode_scene.py .. --write` must write the tokens.
+/// The scene of version 3 has a codec of version 1.
 #[test]
-fn fixture_has_the_tokens_of_the_python_decoder() {
-    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/coded");
-    let room = fixture.join("room.clift");
+fn fixtures_have_the_tokens_of_the_python_decoder() {
+    let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/coded");
     if std::env::var_os("CLIFT_UPDATE").is_some() {
-        let codec = write_model(&fixture);
+        let codec = write_model(&fixtures);
         let mut unusual = scene();
         unusual.tokens[10] = -1e3; // escapes
-        unusual.write_coded(&room, &codec, STEP).unwrap();
+        unusual.write_coded(&fixtures.join("room.clift"), &codec, STEP).unwrap();
     }
-    let (scene, _) = Scene::read(&room).unwrap();
-    assert_eq!(scene.token_ids, [0, 3, 7, 8, 11]);
-    let bytes = std::fs::read(fixture.join("tokens.f32")).unwrap();
-    let expected: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-    assert_eq!(scene.tokens.len(), expected.len());
-    for (got, expected) in scene.tokens.iter().zip(&expected) {
-        assert!((got - expected).abs() < 1e-2, "{got} against {expected}");
+    for fixture in [fixtures.join("version-3"), fixtures] {
+        let (room, _) = Scene::read(&fixture.join("room.clift")).unwrap();
+        assert_eq!(room.token_ids, [0, 3, 7, 8, 11]);
+        assert_same_views(&room, &scene());
+        let bytes = std::fs::read(fixture.join("tokens.f32")).unwrap();
+        let expected: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        assert_eq!(room.tokens.len(), expected.len());
+        for (got, expected) in room.tokens.iter().zip(&expected) {
+            assert!((got - expected).abs() < 1e-2, "{got} against {expected}");
+        }
+        assert!(expected.iter().any(|value| *value < -900.0), "a value far beyond the tables");
     }
-    assert!(expected.iter().any(|value| *value < -900.0), "a value far beyond the tables");
+}
+
+#[test]
+fn views_come_back_with_shared_and_with_different_intrinsics() {
+    let folder = Folder::new();
+    let mut sizes = Vec::new();
+    for focal_offset in [0.0, 2.5] {
+        let mut original = scene();
+        original.context[1].intrinsics = original.context[0].intrinsics;
+        original.context[1].intrinsics[0] += focal_offset;
+        // A half turn about an axis, whose quaternion has no real part.
+        original.context[1].c2w[..11].copy_from_slice(&[-1.0, 0.0, 0.0, 0.5, 0.0, 1.0, 0.0, -0.25, 0.0, 0.0, -1.0]);
+        original.write_coded(&folder.path(), &folder.1, STEP).unwrap();
+        assert_same_views(&Scene::read(&folder.path()).unwrap().0, &original);
+        sizes.push(std::fs::metadata(folder.path()).unwrap().len());
+    }
+    assert_eq!(sizes[1], sizes[0] + 16);
+}
+
+fn assert_same_views(got: &Scene, expected: &Scene) {
+    assert_eq!((got.world, &got.context_frames), (expected.world, &expected.context_frames));
+    assert_eq!(got.context.len(), expected.context.len());
+    for (got, expected) in got.context.iter().zip(&expected.context) {
+        let values = |camera: &ViewCamera| [&camera.c2w[..], &camera.intrinsics].concat();
+        assert!(values(got).iter().zip(values(expected)).all(|(a, b)| (a - b).abs() < 1e-6), "{got:?}");
+    }
 }
