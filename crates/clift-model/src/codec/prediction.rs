@@ -132,8 +132,8 @@ impl Prediction {
         expected.floor().clamp(-MAX_EXPECTED, MAX_EXPECTED) as i32
     }
 
-    /// Returns the deviation from the expected level, in deviations of the coefficient, where `step` is in the latter: that
-    /// of the fit, and the rounding of the neighbours.
+    /// Returns the standard deviation around the expected value at a step: that of the fit, and that of the rounding of the
+    /// neighbours. Both it and `step` are in standard deviations of the coefficient.
     pub(crate) fn deviation(&self, class: usize, direction: usize, step: f64) -> f64 {
         let [w, v] = self.weights(class, direction);
         let scale = f64::from(self.scales[class * self.dim() + direction]);

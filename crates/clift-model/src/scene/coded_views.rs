@@ -12,7 +12,8 @@ const FORMER_VIEW_BYTES: usize = 17 * 4;
 const VIEW_BYTES: usize = 8 * 4;
 const INTRINSICS_BYTES: usize = 4 * 4;
 
-/// Adds the number of intrinsics, which is 1 if those of all views are equal, the intrinsics, and the views.
+/// Adds the number of intrinsics, which is 1 if those of all views are equal, the intrinsics, and the views. A rotation is
+/// stored as a unit quaternion: what is not orthonormal in its matrix, up to the tolerance of the check, is lost.
 pub(crate) fn write_views(context: &[ViewCamera], frames: &[u32], body: &mut Vec<u8>) {
     let intrinsics: Vec<[f32; 4]> = context.iter().map(|camera| camera.intrinsics.map(|value| value as f32)).collect();
     let count = if intrinsics.windows(2).all(|pair| pair[0] == pair[1]) { 1 } else { intrinsics.len() };
