@@ -1,4 +1,4 @@
-"""Decodes a scene file with coded tokens (versions 3 and 4), as docs/reference/files.md describes it.
+"""Decodes a scene file with coded tokens (versions 3 to 5), as docs/reference/files.md describes it.
 
 usage: decode_scene.py SCENE.clift CODEC.safetensors [--write FILE | --check FILE]
 
@@ -84,13 +84,15 @@ def neighbours(ids, rows, columns):
 def decode(scene_path, codec_path):
     data, fields, scene = open_safetensors(scene_path)
     _, info, codec = open_safetensors(codec_path)
-    assert fields["version"] in "34" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
-    body, views, count = scene["scene"].tobytes(), int(fields["views"]), int(fields["tokens"])
-    patch = json.loads(info["model"])["patch_size"]
-    patches = views * (int(fields["height"]) // patch) * (int(fields["width"]) // patch)
+    assert fields["version"] in "345" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
+    body, version, count = scene["scene"].tobytes(), fields["version"], int(fields["tokens"])
+    sizes = fields["views"].split("x") if version == "5" else [fields[name] for name in ("views", "height", "width")]
+    patch, (views, height, width) = json.loads(info["model"])["patch_size"], map(int, sizes)
+    rows, columns = height // patch, width // patch
+    patches = views * rows * columns
     step = float(np.frombuffer(body[:4], "<f4")[0])
-    start = 4 + 13 * 8
-    start += views * 68 if fields["version"] == "3" else 4 + 16 * struct.unpack_from("<I", body, start)[0] + views * 32
+    start = 4 + (48 if version == "5" else 13 * 8)
+    start += views * 68 if version == "3" else 4 + 16 * struct.unpack_from("<I", body, start)[0] + views * 32
     decoder = Decoder(np.frombuffer(body[start:-4], "<u4").tolist())
     ids = []
     for index in range(patches):
@@ -102,7 +104,7 @@ def decode(scene_path, codec_path):
     levels, groups = np.zeros((count, len(deviations))), len(LIMITS) + 2
     weights = codec.get("weights", np.zeros((groups, len(deviations), 2))).astype(float)
     scales = codec.get("scales", np.ones((groups, len(deviations)))).astype(float)
-    near = neighbours(ids, int(fields["height"]) // patch, int(fields["width"]) // patch)
+    near = neighbours(ids, rows, columns)
     for direction, deviation in enumerate(deviations):
         ratio, reach = step / deviation, np.abs(weights[:, direction]).sum(1)
         spreads = np.sqrt(scales[:, direction] * scales[:, direction] + reach * reach * min(ratio * ratio / 12.0, 1.0))

@@ -11,7 +11,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-kernels",
         "",
-        "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16",
+        "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
     ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights codec scene"),
     (

@@ -30,6 +30,7 @@ mod layer_norm;
 mod linear;
 mod matmul_bf16;
 mod primitives;
+mod rms_norm;
 mod simd;
 #[cfg(test)]
 mod testing;
@@ -53,3 +54,4 @@ pub use gelu::{gelu_backward, gelu_forward};
 pub use layer_norm::{layer_norm_backward, layer_norm_forward, sum_rows};
 pub use linear::linear_forward;
 pub use matmul_bf16::{Matrix, matmul_bf16};
+pub use rms_norm::{HeadRows, rms_norm_backward, rms_norm_forward};

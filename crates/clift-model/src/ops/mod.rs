@@ -10,6 +10,7 @@
 //! Operations:
 //! - `gelu`: GELU with exact gradient
 //! - `layer_norm`: layer normalization
+//! - `rms_norm`: RMS norms of the heads of queries and keys
 //! - `linear`: linear layer, alone or fused with a layer norm or GELU
 //! - `attention`: softmax attention
 //! - `cluster_attention`: attention inside clusters, linear in the number of tokens
@@ -25,4 +26,5 @@ pub(crate) mod layer_norm;
 pub(crate) mod linear;
 pub(crate) mod mac_counter;
 pub(crate) mod precision;
+pub(crate) mod rms_norm;
 pub(crate) mod saved;

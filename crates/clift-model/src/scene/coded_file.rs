@@ -1,20 +1,20 @@
-//! Version 4 of the scene file: coded tokens.
+//! Version 5 of the scene file: coded tokens.
 //!
 //! | part | type |
 //! |---|---|
 //! | length of the header, little-endian | u64 |
 //! | header: JSON of safetensors with one tensor, `scene`, which is the rest of the file | |
 //! | step of the coefficients | f32 |
-//! | `world_mean_c2w`, first three rows, and `world_scale`: the normalization of poses | 13 x f64 |
+//! | `world_mean_c2w` and `world_scale`, the normalization of poses: quaternion `x, y, z, w`, center, scale | 4 x f32, 4 x f64 |
 //! | number of intrinsics: 1 if the views have the same, else that of the views | u32 |
 //! | for each of them: `fx, fy, cx, cy` in pixels | 4 x f32 |
 //! | for each context view: quaternion `x, y, z, w` and center of the pose, frame number | 7 x f32, u32 |
 //! | words of the entropy coder: token ids, then levels by direction | u32 |
 //! | CRC-32 of everything before | u32 |
 //!
-//! `__metadata__` holds strings: `format` = `clift-scene`, `version` = `4`, `key`, `codec` (hash of the model's codec),
-//! `model_path`, `height` and `width`, `views` and `tokens` (counts). Everything else is in the codec, see
-//! [`TokenCodec`]. Version 3 has other views. `docs/reference/files.md` describes how tokens are decoded.
+//! `__metadata__` holds strings: `format` = `clift-scene`, `version` = `5`, `key`, `codec` (hash of the model's codec),
+//! `model_path`, `views` (number, height and width, as `4x64x64`) and `tokens` (their number). Everything else is in the
+//! codec, see [`TokenCodec`]. Version 3 has other views, versions 3 and 4 another normalization. `docs/reference/files.md` describes how tokens are decoded.
 // N patches of the context views, S tokens, V context views
 
 use std::fmt::Write as _;
@@ -25,15 +25,11 @@ use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
 use crate::files::replace;
 use crate::network::config::ModelConfig;
-use crate::scene::coded_views::{read_views, write_views};
+use crate::scene::coded_views::{read_views, read_world, write_views, write_world};
 use crate::scene::header::{COPY_AGAIN, Fields, GIVE_MODEL, Refusal, refusal, write_fields};
-use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, SceneNormalization};
+use crate::scene::scene::{CODED_VERSION, FORMAT, Scene};
 use crate::scene::token_coding::{CodedLoss, TokenCoding};
 use crate::scene::write::{WRITABLE_FOLDER, check_output_path};
-
-const WORLD_VALUES: usize = 13;
-/// Bytes of step and normalization.
-const FIXED_BYTES: usize = 4 + WORLD_VALUES * 8;
 
 impl Scene {
     /// Returns the bytes of the scene's coded file. Tokens are stored in the order of their ids.
@@ -49,23 +45,20 @@ impl Scene {
         let words = codec.encode(&self.tokens, self.places(), step)?;
 
         let mut body = step.to_le_bytes().to_vec();
-        let world = self.world.mean_c2w[..12].iter().chain([&self.world.scale]);
-        body.extend(world.flat_map(|value| value.to_le_bytes()));
+        write_world(&self.world, &mut body);
         write_views(&self.context, &self.context_frames, &mut body);
         body.extend(words.iter().flat_map(|word| word.to_le_bytes()));
         let length = body.len() + 4;
 
-        let counts = [self.height, self.width, self.context.len(), self.num_tokens()].map(|count| count.to_string());
+        let views = format!("{}x{}x{}", self.context.len(), self.height, self.width);
         let mut header = write_fields(&[
             ("format", FORMAT),
             ("version", CODED_VERSION),
             ("key", &self.key),
             ("codec", &codec.hash),
             ("model_path", &self.model_path),
-            ("height", &counts[0]),
-            ("width", &counts[1]),
-            ("views", &counts[2]),
-            ("tokens", &counts[3]),
+            ("views", &views),
+            ("tokens", &self.num_tokens().to_string()),
         ]);
         let _ = write!(header, ",\"scene\":{{\"dtype\":\"U8\",\"shape\":[{length}],\"data_offsets\":[0,{length}]}}}}");
         let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
@@ -121,32 +114,29 @@ pub(crate) fn from_coded_bytes(
         let reason = format!("the scene was coded with the codec {hash}, the model has {}", codec.hash);
         return Err(refusal(reason, GIVE_MODEL));
     }
-    let [views, num_tokens] = [fields.count("views")?, fields.count("tokens")?];
+    let ([views, height, width], num_tokens) = (fields.views()?, fields.count("tokens")?);
+    let version = fields.get("version")?;
     let split = || {
-        let (fixed, rest) = body[..body.len().saturating_sub(4)].split_at_checked(FIXED_BYTES)?;
-        let (views, words) = read_views(fields.get("version").ok()?, views, rest)?;
-        (words.len() % 4 == 0).then_some((fixed.split_at(4), views, words))
+        let (step, rest) = body[..body.len().saturating_sub(4)].split_first_chunk::<4>()?;
+        let (world, rest) = read_world(version, rest)?;
+        let (views, words) = read_views(version, views, rest)?;
+        (words.len() % 4 == 0).then_some((f32::from_le_bytes(*step), world, views, words))
     };
-    let Some(((step, world), (context, context_frames), words)) = split() else {
+    let Some((step, world, (context, context_frames), words)) = split() else {
         return Err(format!("{} bytes of {views} views and coded tokens", body.len()).into());
     };
-    let step = f32::from_le_bytes(step.try_into().expect("4 bytes"));
-    let world: Vec<f64> = world.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
     let words = words.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect();
-    let mut mean_c2w = [0.0; 16];
-    mean_c2w[..12].copy_from_slice(&world[..12]);
-    mean_c2w[15] = 1.0;
     let mut scene = Scene {
         key: fields.get("key")?.into(),
         kind: codec.kind,
         model: codec.model.clone(),
         renderer_hash: codec.renderer_hash.clone(),
         model_path: fields.get("model_path")?.into(),
-        height: fields.count("height")?,
-        width: fields.count("width")?,
+        height,
+        width,
         context,
         context_frames,
-        world: SceneNormalization { mean_c2w, scale: world[12] },
+        world,
         token_ids: Vec::new(),
         tokens: Vec::new(),
     };

@@ -1,28 +1,50 @@
-//! The context views of a coded scene file.
+//! Normalization and context views of a coded scene file.
 // V context views
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
-use crate::scene::scene::CODED_VERSION;
+use crate::scene::scene::{CODED_VERSION, FORMER_CODED_VERSIONS, SceneNormalization};
 use crate::views::camera::ViewCamera;
 
+/// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
+const WORLD_BYTES: usize = 4 * 4 + 4 * 8;
+/// Bytes of the normalization before version 5: three rows of the pose and the scale in f64.
+const FORMER_WORLD_BYTES: usize = 13 * 8;
 /// Bytes of a view in version 3: three rows of the pose, `fx, fy, cx, cy`, and the frame number.
 const FORMER_VIEW_BYTES: usize = 17 * 4;
 /// Bytes of a view: rotation, center and frame number.
 const VIEW_BYTES: usize = 8 * 4;
 const INTRINSICS_BYTES: usize = 4 * 4;
 
-/// Adds the number of intrinsics, which is 1 if those of all views are equal, the intrinsics, and the views. A rotation is
-/// stored as a unit quaternion: what is not orthonormal in its matrix, up to the tolerance of the check, is lost.
+/// Adds the normalization. As in the views, a rotation is stored as a unit quaternion: what is not orthonormal in its matrix,
+/// up to the tolerance of the check, is lost.
+pub(crate) fn write_world(world: &SceneNormalization, body: &mut Vec<u8>) {
+    body.extend(f32_bytes(&quaternion(&world.mean_c2w)));
+    let [x, y, z] = [3, 7, 11].map(|i| world.mean_c2w[i]);
+    body.extend([x, y, z, world.scale].into_iter().flat_map(f64::to_le_bytes));
+}
+
+/// Reads the normalization of a file of this version; returns it and the rest of the bytes. `None` if there are too few bytes.
+pub(crate) fn read_world<'a>(version: &str, bytes: &'a [u8]) -> Option<(SceneNormalization, &'a [u8])> {
+    if version != CODED_VERSION {
+        let (bytes, rest) = bytes.split_at_checked(FORMER_WORLD_BYTES)?;
+        let [.., scale] = doubles::<13>(bytes);
+        return Some((SceneNormalization { mean_c2w: from_rows(&doubles::<12>(bytes)), scale }, rest));
+    }
+    let (bytes, rest) = bytes.split_at_checked(WORLD_BYTES)?;
+    let [x, y, z, scale] = doubles(&bytes[16..]);
+    Some((SceneNormalization { mean_c2w: pose(floats(bytes), [x, y, z]), scale }, rest))
+}
+
+/// Adds the number of intrinsics, which is 1 if those of all views are equal, the intrinsics, and the views.
 pub(crate) fn write_views(context: &[ViewCamera], frames: &[u32], body: &mut Vec<u8>) {
-    let intrinsics: Vec<[f32; 4]> = context.iter().map(|camera| camera.intrinsics.map(|value| value as f32)).collect();
+    let intrinsics: Vec<Vec<u8>> = context.iter().map(|camera| f32_bytes(&camera.intrinsics)).collect();
     let count = if intrinsics.windows(2).all(|pair| pair[0] == pair[1]) { 1 } else { intrinsics.len() };
     body.extend((count as u32).to_le_bytes());
-    body.extend(intrinsics[..count].iter().flatten().flat_map(|value| value.to_le_bytes()));
+    body.extend(intrinsics[..count].concat());
     for (camera, frame) in context.iter().zip(frames) {
-        let rotation = DQuat::from_mat3(&DMat3::from_mat4(DMat4::from_cols_array(&camera.c2w).transpose()));
-        let values = rotation.to_array().into_iter().chain(camera.origin());
-        body.extend(values.flat_map(|value| (value as f32).to_le_bytes()));
+        body.extend(f32_bytes(&quaternion(&camera.c2w)));
+        body.extend(f32_bytes(&camera.origin()));
         body.extend(frame.to_le_bytes());
     }
 }
@@ -33,7 +55,7 @@ type Views = (Vec<ViewCamera>, Vec<u32>);
 /// Reads `views` views of a file of this version; returns cameras, frame numbers and the rest of the bytes. `None` if there
 /// are too few bytes.
 pub(crate) fn read_views<'a>(version: &str, views: usize, bytes: &'a [u8]) -> Option<(Views, &'a [u8])> {
-    if version != CODED_VERSION {
+    if version == FORMER_CODED_VERSIONS[0] {
         let (bytes, rest) = bytes.split_at_checked(views.checked_mul(FORMER_VIEW_BYTES)?)?;
         return Some((bytes.chunks_exact(FORMER_VIEW_BYTES).map(former_view).unzip(), rest));
     }
@@ -46,20 +68,40 @@ pub(crate) fn read_views<'a>(version: &str, views: usize, bytes: &'a [u8]) -> Op
     let intrinsics: Vec<[f64; 4]> = intrinsics.chunks_exact(INTRINSICS_BYTES).map(floats).collect();
     let (bytes, rest) = bytes.split_at_checked(views.checked_mul(VIEW_BYTES)?)?;
     let view = |(i, bytes): (usize, &[u8])| {
-        // Of damaged numbers the pose contains NaN, which the check of the scene finds.
-        let rotation = DQuat::from_array(floats(bytes)).normalize();
-        let pose = DMat4::from_rotation_translation(rotation, DVec3::from_array(floats(&bytes[16..])));
-        let camera = ViewCamera { c2w: pose.transpose().to_cols_array(), intrinsics: intrinsics[i.min(count - 1)] };
-        (camera, frame(bytes))
+        let c2w = pose(floats(bytes), floats(&bytes[16..]));
+        (ViewCamera { c2w, intrinsics: intrinsics[i.min(count - 1)] }, frame(bytes))
     };
     Some((bytes.chunks_exact(VIEW_BYTES).enumerate().map(view).unzip(), rest))
 }
 
 fn former_view(bytes: &[u8]) -> (ViewCamera, u32) {
-    let mut c2w = [0.0; 16];
-    c2w[..12].copy_from_slice(&floats::<12>(bytes));
-    c2w[15] = 1.0;
-    (ViewCamera { c2w, intrinsics: floats(&bytes[48..]) }, frame(bytes))
+    (ViewCamera { c2w: from_rows(&floats(bytes)), intrinsics: floats(&bytes[48..]) }, frame(bytes))
+}
+
+/// Returns the pose of three rows.
+fn from_rows(rows: &[f64; 12]) -> [f64; 16] {
+    std::array::from_fn(|i| if i == 15 { 1.0 } else { rows.get(i).copied().unwrap_or(0.0) })
+}
+
+/// Returns the pose of a quaternion and a center. That of damaged numbers contains NaN, which the check of the scene finds.
+fn pose(quaternion: [f64; 4], center: [f64; 3]) -> [f64; 16] {
+    let rotation = DQuat::from_array(quaternion).normalize();
+    DMat4::from_rotation_translation(rotation, DVec3::from_array(center)).transpose().to_cols_array()
+}
+
+/// Returns the rotation of a pose, `x, y, z, w`.
+fn quaternion(c2w: &[f64; 16]) -> [f64; 4] {
+    DQuat::from_mat3(&DMat3::from_mat4(DMat4::from_cols_array(c2w).transpose())).to_array()
+}
+
+fn f32_bytes(values: &[f64]) -> Vec<u8> {
+    values.iter().flat_map(|value| (*value as f32).to_le_bytes()).collect()
+}
+
+/// Returns the first numbers of bytes.
+fn doubles<const N: usize>(bytes: &[u8]) -> [f64; N] {
+    let values = bytes.as_chunks::<8>().0;
+    std::array::from_fn(|i| f64::from_le_bytes(values[i]))
 }
 
 /// Returns the first numbers of bytes.

@@ -12,7 +12,7 @@ use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
 use crate::scene::scene::{
-    CODED_VERSION, FORMAT, FORMER_CODED_VERSION, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name,
+    CODED_VERSION, FORMAT, FORMER_CODED_VERSIONS, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name,
 };
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
@@ -85,7 +85,7 @@ fn from_bytes(
         return Err(refusal("the file is no scene: its header lacks the scene format", GIVE_ANOTHER));
     }
     let version = fields.get("version")?;
-    if [CODED_VERSION, FORMER_CODED_VERSION].contains(&version) {
+    if version == CODED_VERSION || FORMER_CODED_VERSIONS.contains(&version) {
         let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
         return from_coded_bytes(bytes, body, &fields, find_codec);
     }

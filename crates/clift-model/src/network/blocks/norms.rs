@@ -6,6 +6,7 @@ use burn::tensor::Tensor;
 
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
+use crate::ops::rms_norm::rms_norm_heads;
 
 /// A layer norm of the encoder's tokens in the released DL3DV network, the identity in the others. Stage 2 freezes the
 /// encoder; both stages train this norm.
@@ -51,34 +52,16 @@ impl QkNorm {
 
     /// Normalises queries, `[batch, count, dim]`.
     pub(crate) fn query(&self, query: Tensor<3>) -> Tensor<3> {
-        per_head(&self.query, query)
+        rms_norm_heads(query, [&self.query], 1)
     }
 
     /// Normalises the keys of packed keys and values, `[batch, count, 2 dim]`.
     pub(crate) fn key_value(&self, key_value: Tensor<3>) -> Tensor<3> {
-        let [key, value] = split(&key_value);
-        Tensor::cat(vec![per_head(&self.key, key), value], 2)
+        rms_norm_heads(key_value, [&self.key], 2)
     }
 
     /// Normalises the queries and keys of packed queries, keys and values, `[batch, count, 3 dim]`.
     pub(crate) fn query_key_value(&self, query_key_value: Tensor<3>) -> Tensor<3> {
-        let [query, key, value] = split(&query_key_value);
-        Tensor::cat(vec![per_head(&self.query, query), per_head(&self.key, key), value], 2)
+        rms_norm_heads(query_key_value, [&self.query, &self.key], 3)
     }
-}
-
-/// Splits the columns into equal parts.
-fn split<const COUNT: usize>(x: &Tensor<3>) -> [Tensor<3>; COUNT] {
-    let [_batch, _count, columns] = x.dims();
-    let width = columns / COUNT;
-    std::array::from_fn(|part| x.clone().narrow(2, part * width, width))
-}
-
-/// Normalises every head. Burn's own forward computes the squares in f32; this one keeps the type of `x`.
-fn per_head(norm: &RmsNorm, x: Tensor<3>) -> Tensor<3> {
-    let [batch, count, dim] = x.dims();
-    let [head_width] = norm.gamma.dims();
-    let x = x.reshape([batch, count, dim / head_width, head_width]); // [B, N, H, E]
-    let scale = (x.clone().square().mean_dim(3) + norm.epsilon).sqrt();
-    (x / scale * norm.gamma.val().reshape([1, 1, 1, head_width])).reshape([batch, count, dim])
 }

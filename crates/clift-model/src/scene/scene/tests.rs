@@ -187,7 +187,7 @@ fn invalid_headers_are_refused() {
         (
             r#""version":"2""#,
             r#""version":"9""#,
-            r#"file version "9", expected "1" to "4"; use the version of clift that"#,
+            r#"file version "9", expected "1" to "5"; use the version of clift that"#,
         ),
         (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
         (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number"#),
