@@ -116,7 +116,8 @@ fn composed_output<B: Backend>([x, gammas]: [FloatTensor<B>; 2], rows: HeadRows)
     parts.replace::<B>(x, B::float_mul(normal, parts.per_head::<B>(gammas)))
 }
 
-/// Computes the gradients. With `y = x r` and `g = dO gamma`: `dx = r (g - y mean(g y))`, `dgamma = sum(dO y)` over tokens and heads.
+/// Computes the gradients. With `y = x r` and `g = dO gamma`: `dx = r (g - y mean(g y))`, `dgamma = sum(dO y)` over tokens
+/// and heads.
 fn composed_backward<B: Backend>(
     [x, gammas]: [FloatTensor<B>; 2],
     grad: FloatTensor<B>,

@@ -1,9 +1,10 @@
 //! The scene file, and rendering from it.
 //!
 //! `scene` holds a stored scene and documents the bytes of its file; `check` the rules of a valid scene; `read` and
-//! `write` the file itself, with its `header` and the tokens in a `token_format`; `coded_file` the file with coded tokens and its `coded_views`;
-//! `token_coding` the names of both ways; `model_place` the path of its model. `scene_renderer` renders frames of a scene on a device,
-//! and `render_budget` measures how many tokens a time per frame allows.
+//! `write` the file itself, with its `header` and the tokens in a `token_format`; `coded_file` the file with coded tokens,
+//! and `coded_views` its cameras; `token_coding` the names of both ways; `model_place` the path of its model.
+//! `scene_renderer` renders frames of a scene on a device, and `render_budget` measures how many tokens a time per frame
+//! allows.
 
 pub(crate) mod check;
 pub(crate) mod coded_file;
