@@ -17,6 +17,9 @@ const ATTEMPTS: usize = 24;
 const GOOD: f32 = 0.85;
 /// Number of rays along each side of the views that check a path.
 const GLANCE: usize = 6;
+/// Largest distance of the principal point from the image center, in image sizes: two pixels of 64. Patches of four pixels
+/// then begin at any pixel, as those of shifted patch grids do.
+const OFF_CENTER: f32 = 1.0 / 32.0;
 
 /// Where a camera may go.
 pub(crate) struct Area {
@@ -181,7 +184,7 @@ impl Path {
         middle + Vec3::from(swing)
     }
 
-    /// Returns the camera of one frame, with square pixels.
+    /// Returns the camera of one frame, with square pixels and a principal point of its own.
     pub fn camera(&self, time: f32, aspect: f64, frame: usize) -> Camera {
         let position = self.position(time);
         let [mut yaw, mut pitch, roll] = self.shake.map(|wave| sway(wave, time));
@@ -201,8 +204,10 @@ impl Path {
             .map(|(angle, part)| f64::from(angle + self.jitter * (2.0 * byte(noise, part) - 1.0)));
         let rotation = DMat3::from_rotation_y(yaw) * DMat3::from_rotation_x(-pitch) * DMat3::from_rotation_z(roll);
         let fx = 0.5 / (0.5 * f64::from(self.fov_deg).to_radians()).tan();
+        let shift = hash(frame as i32, 1, self.seed);
+        let [cx, cy] = [0, 1].map(|part| f64::from(0.5 + OFF_CENTER * (2.0 * byte(shift, part) - 1.0)));
         Camera {
-            intrinsics_norm: IntrinsicsNorm { fx, fy: fx * aspect, cx: 0.5, cy: 0.5 },
+            intrinsics_norm: IntrinsicsNorm { fx, fy: fx * aspect, cx, cy },
             c2w: Pose { rotation, translation: position.as_dvec3() },
         }
     }
