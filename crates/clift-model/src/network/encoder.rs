@@ -58,8 +58,8 @@ impl Encoder {
     ///   `[batch, num_latents, dim]`
     pub fn forward(&self, context: &Views) -> Tokens {
         let transforms = self.transforms(&context.cameras);
-        let x = self.blocks.iter().fold(self.embed(context), |x, block| block.forward(x, transforms.as_ref()));
-        Tokens { values: self.to_tokens(x), transforms }
+        let forward = |x, block| self.block(block, x, transforms.as_ref());
+        Tokens { values: (0..self.num_blocks()).fold(self.embed(context), forward), transforms }
     }
 
     /// Makes the transforms of the tokens for camera-relative attention; `None` without it.
@@ -78,20 +78,22 @@ impl Encoder {
         Tensor::cat(vec![weight.val().expand([batch, count, dim]), patches], 1) // [B, L + N, D]
     }
 
-    /// Returns the blocks after [`embed`](Self::embed).
-    pub fn blocks(&self) -> &[EncoderBlock] {
-        &self.blocks
+    /// Returns the number of blocks after [`embed`](Self::embed).
+    pub fn num_blocks(&self) -> usize {
+        self.blocks.len()
     }
 
-    /// Returns the tokens of a scene, given the output of the last block.
+    /// Applies a block. The last one returns the tokens of the scene: beside latents, the patches are dropped.
     ///
     /// # Shapes
     /// - `x`: `[batch, rows, dim]`, as [`embed`](Self::embed) returns
-    /// - returns `[batch, num_tokens, dim]`
-    pub fn to_tokens(&self, x: Tensor<3>) -> Tensor<3> {
+    /// - returns the same, or `[batch, num_tokens, dim]` from the last block
+    pub fn block(&self, block: usize, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
         match &self.latents {
-            Some(Latents { weight }) => x.narrow(1, 0, weight.dims()[1]),
-            None => x,
+            Some(Latents { weight }) if block + 1 == self.blocks.len() => {
+                self.blocks[block].forward_first(x, weight.dims()[1])
+            }
+            _ => self.blocks[block].forward(x, transforms),
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::network::init::Init;
 #[derive(Module, Debug)]
 pub(crate) struct JointDecoder {
     input_norm: LayerNorm,
-    pub(crate) blocks: Vec<EncoderBlock>,
+    blocks: Vec<EncoderBlock>,
     /// Whether the norm covers the patches too, as in LVSM's paper; in `CLiFT`'s release it covers the latents alone.
     #[module(skip)]
     normalizes_patches: bool,
@@ -27,6 +27,10 @@ impl JointDecoder {
             blocks: (0..config.num_renderer_blocks).map(|i| EncoderBlock::new(config, init.block(Some(i)))).collect(),
             normalizes_patches: !config.variant.is_released(),
         })
+    }
+
+    pub fn num_blocks(&self) -> usize {
+        self.blocks.len()
     }
 
     /// Joins the patches of every view with the latents of its scene: the input of the first block.
@@ -43,6 +47,20 @@ impl JointDecoder {
         let joined = Tensor::cat(vec![patches, of_views.reshape([views, count, dim])], 1);
         if self.normalizes_patches { norm(joined) } else { joined }
     }
+
+    /// Applies a block. The last one returns the patches alone.
+    ///
+    /// # Shapes
+    /// - `x`: `[batch * views, num_queries + num_latents, dim]`
+    /// - returns the same, or `[batch * views, num_queries, dim]` from the last block
+    pub fn block(&self, block: usize, x: Tensor<3>, num_latents: usize) -> Tensor<3> {
+        let [_, rows, _] = x.dims();
+        if block + 1 == self.blocks.len() {
+            self.blocks[block].forward_first(x, rows - num_latents)
+        } else {
+            self.blocks[block].forward(x, None)
+        }
+    }
 }
 
 #[cfg(test)]
@@ -55,13 +73,13 @@ mod tests {
     fn gradients_equal_central_differences_in_f64() {
         for variant in [CliftVariant::Paper, CliftVariant::ReleasedRe10k] {
             for device in cpu_devices() {
-                let config = ModelConfig { dim: 6, num_heads: 3, num_renderer_blocks: 1, ..small_lvsm(variant) };
+                let config = ModelConfig { dim: 6, num_heads: 3, num_renderer_blocks: 2, ..small_lvsm(variant) };
                 // PyTorch's distributions: LVSM's small matrices give near-uniform attention.
                 let mut init = Init::new(5, &device);
                 let joint = to_f64(JointDecoder::new(&config, &mut init).expect("of LVSM"));
                 let forward = |[patches, latents]: [Tensor<3>; 2]| {
                     let joint = if patches.is_autodiff() { joint.clone().train() } else { joint.clone() };
-                    joint.blocks[0].forward(joint.join(patches, latents), None)
+                    (0..2).fold(joint.join(patches, latents), |x, block| joint.block(block, x, 2))
                 };
                 // Two views of each of two scenes.
                 let inputs = [random([4, 3, 6], 6, &device), random([2, 2, 6], 7, &device)];

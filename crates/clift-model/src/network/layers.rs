@@ -112,6 +112,7 @@ const STORED: Sequence = &[Rows::StoredTokens];
 const GATHERING: Sequence = &[Rows::GatheringTokens];
 const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
 const TARGETS: Sequence = &[Rows::TargetPatches];
+const LATENTS: Sequence = &[Rows::Latents];
 const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
 const TARGETS_AND_LATENTS: Sequence = &[Rows::TargetPatches, Rows::RenderTokens];
 
@@ -122,17 +123,20 @@ fn lvsm_layers(config: &ModelConfig) -> Vec<Layer> {
     list.enter(Part::Encoder, None, "encoder");
     list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
     list.push("latents", LayerKind::Table { rows: num_latents, width: dim }, LATENTS_AND_CONTEXT, false);
-    for i in 0..config.num_encoder_blocks {
+    // The last block of either network computes the rows that are read after it.
+    let num_blocks = config.num_encoder_blocks;
+    for i in 0..num_blocks {
         list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
-        list.encoder_block(LATENTS_AND_CONTEXT);
+        list.encoder_block(LATENTS_AND_CONTEXT, if i + 1 == num_blocks { LATENTS } else { LATENTS_AND_CONTEXT });
     }
 
     list.enter(Part::Renderer, None, "renderer");
     list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
     list.norm("joint.input_norm", if config.variant.is_released() { RENDER_TOKENS } else { TARGETS_AND_LATENTS });
-    for i in 0..config.num_renderer_blocks {
+    let num_blocks = config.num_renderer_blocks;
+    for i in 0..num_blocks {
         list.enter(Part::Renderer, Some(i), &format!("renderer.joint.blocks.{i}"));
-        list.encoder_block(TARGETS_AND_LATENTS);
+        list.encoder_block(TARGETS_AND_LATENTS, if i + 1 == num_blocks { TARGETS } else { TARGETS_AND_LATENTS });
     }
     list.enter(Part::Renderer, None, "renderer");
     list.norm("output_norm", TARGETS);
@@ -148,7 +152,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
     for i in 0..config.num_encoder_blocks {
         list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
-        list.encoder_block(CONTEXT);
+        list.encoder_block(CONTEXT, CONTEXT);
     }
     if config.has_token_norm() {
         list.enter(Part::TokenNorm, None, "lift_norm");
@@ -174,7 +178,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     let residual = config.condenser.residual;
     for i in 0..config.condenser.num_blocks {
         list.enter(Part::Condenser, Some(i), &format!("condenser.blocks.{i}"));
-        list.self_attention("self_attn", STORED);
+        list.self_attention("self_attn", STORED, STORED);
         list.norm("norm_self", STORED);
         if residual {
             list.norm("norm_cross", GATHERING);
@@ -218,12 +222,12 @@ impl LayerList<'_> {
         self.push(name, LayerKind::LayerNorm { width: self.config.dim, bias }, rows, true);
     }
 
-    /// Adds self-attention after a norm, with one packed projection.
-    fn self_attention(&mut self, name: &str, rows: Sequence) {
+    /// Adds self-attention of the first rows, `queries`, to all after a norm, with one packed projection.
+    fn self_attention(&mut self, name: &str, rows: Sequence, queries: Sequence) {
         let ModelConfig { dim, num_heads, .. } = *self.config;
         self.linear(&format!("{name}.in_proj"), [dim, 3 * dim], rows, false);
-        self.push(name, LayerKind::Attention { width: dim, heads: num_heads, keys: rows }, rows, true);
-        self.attention_output(name, rows, rows);
+        self.push(name, LayerKind::Attention { width: dim, heads: num_heads, keys: rows }, queries, true);
+        self.attention_output(name, queries, rows);
     }
 
     /// Adds cross-attention: in the condenser to the tokens of a cluster, in the renderer to all.
@@ -257,17 +261,17 @@ impl LayerList<'_> {
         self.linear("feed_forward.down", [hidden, dim], rows, false);
     }
 
-    /// Adds PyTorch's pre-norm encoder layer.
-    fn encoder_block(&mut self, rows: Sequence) {
-        self.self_attention("attn", rows);
-        self.feed_forward(rows);
+    /// Adds PyTorch's pre-norm encoder layer, which computes the first rows, `outputs`.
+    fn encoder_block(&mut self, rows: Sequence, outputs: Sequence) {
+        self.self_attention("attn", rows, outputs);
+        self.feed_forward(outputs);
         self.norm("norm_attn", rows);
-        self.norm("norm_ff", rows);
+        self.norm("norm_ff", outputs);
     }
 
     /// Adds PyTorch's pre-norm decoder layer.
     fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
-        self.self_attention("self_attn", rows);
+        self.self_attention("self_attn", rows, rows);
         self.cross_attention(rows, false, keys);
         self.feed_forward(rows);
         for name in ["norm_self", "norm_cross", "norm_ff"] {

@@ -149,13 +149,14 @@ impl Renderer {
 
     /// Returns the number of blocks between [`embed`](Self::embed) and [`to_image`](Self::to_image).
     pub fn num_blocks(&self) -> usize {
-        self.joint.as_ref().map_or(self.blocks.len(), |joint| joint.blocks.len())
+        self.joint.as_ref().map_or(self.blocks.len(), JointDecoder::num_blocks)
     }
 
     /// Applies a block to the patches of target views.
     ///
     /// # Shapes
-    /// - `x` and the result: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
+    /// - `x`: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
+    /// - returns the same, or `[batch * views, num_queries, dim]` from the last block
     pub fn block(
         &self,
         block: usize,
@@ -164,7 +165,7 @@ impl Renderer {
         transforms: Option<&TokenTransforms>,
     ) -> Tensor<3> {
         if let Some(joint) = &self.joint {
-            return joint.blocks[block].forward(x, None);
+            return joint.block(block, x, tokens.num_render_tokens());
         }
         let block = &self.blocks[block];
         block.forward(x, tokens.project(block), transforms)
@@ -173,12 +174,11 @@ impl Renderer {
     /// Decodes the output of the last block into images.
     ///
     /// # Shapes
-    /// - `x`: `[batch * views, rows, dim]`, as [`embed`](Self::embed) returns
+    /// - `x`: `[batch * views, num_queries, dim]`
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn to_image(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
         let [batch, views] = targets.dims();
         let num_queries = targets.height / self.patch_size * (targets.width / self.patch_size);
-        let x = if self.joint.is_some() { x.narrow(1, 0, num_queries) } else { x };
         let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x));
         let [_, _, values] = patches.dims();
         let patches = patches.reshape([batch, views * num_queries, values]);

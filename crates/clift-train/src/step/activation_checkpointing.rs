@@ -7,7 +7,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
-use clift_model::{Cameras, Clift, EncoderBlock, Tokens, Views};
+use clift_model::{Cameras, Clift, Tokens, Views};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -34,14 +34,16 @@ pub(crate) fn backward(
     let targets = untracked(&device_batch.targets);
     let context_transforms = plain.encoder.transforms(&context.cameras);
     let target_transforms = plain.renderer.transforms(&targets);
-    let encode = |block: &EncoderBlock, x: Tensor<3>| block.forward(x, context_transforms.as_ref());
-    let (encoder_inputs, encoded) = block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), encode);
-    let lift = Tokens { values: plain.encoder.to_tokens(encoded.clone()), transforms: context_transforms.clone() };
+    let (encoder_inputs, encoded) =
+        block_inputs(plain.encoder.embed(&context), plain.encoder.num_blocks(), |block, x| {
+            plain.encoder.block(block, x, context_transforms.as_ref())
+        });
+    let lift = Tokens { values: encoded, transforms: context_transforms };
     let tokens = batch_tokens.apply(&plain.condenser, plain.normalize(lift.clone()))?;
-    let blocks: Vec<usize> = (0..plain.renderer.num_blocks()).collect();
-    let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&tokens, &targets), &blocks, |&block, x| {
-        plain.renderer.block(block, x, &tokens, target_transforms.as_ref())
-    });
+    let (renderer_inputs, x) =
+        block_inputs(plain.renderer.embed(&tokens, &targets), plain.renderer.num_blocks(), |block, x| {
+            plain.renderer.block(block, x, &tokens, target_transforms.as_ref())
+        });
 
     // Backward, one block after the other.
     let x = leaf(x);
@@ -61,7 +63,7 @@ pub(crate) fn backward(
         });
     };
     let target_transforms = model.renderer.transforms(&device_batch.targets);
-    for (block, input) in blocks.into_iter().zip(renderer_inputs).rev() {
+    for (block, input) in renderer_inputs.into_iter().enumerate().rev() {
         let (x, block_tokens) = (leaf(input), leaf(tokens.values().clone()));
         let tokens = tokens.with_values(block_tokens.clone());
         let output = model.renderer.block(block, x.clone(), &tokens, target_transforms.as_ref());
@@ -79,8 +81,8 @@ pub(crate) fn backward(
         return Ok(parts); // a renderer without blocks reads no token
     };
 
-    let encoded = leaf(encoded);
-    let lift = lift.with_values(model.encoder.to_tokens(encoded.clone()));
+    let encoded = leaf(lift.values.clone());
+    let lift = lift.with_values(encoded.clone());
     let output = batch_tokens.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
     let mut grads = backward_from(output, grad_tokens);
     let mut grad_x = take_gradient(&encoded, &mut grads);
@@ -88,9 +90,9 @@ pub(crate) fn backward(
     if !trains(&model.encoder) {
         return Ok(parts);
     }
-    for (block, input) in model.encoder.blocks().iter().zip(encoder_inputs).rev() {
+    for (block, input) in encoder_inputs.into_iter().enumerate().rev() {
         let x = leaf(input);
-        let mut grads = backward_from(block.forward(x.clone(), lift.transforms.as_ref()), grad_x);
+        let mut grads = backward_from(model.encoder.block(block, x.clone(), lift.transforms.as_ref()), grad_x);
         grad_x = take_gradient(&x, &mut grads);
         add(grads);
     }
@@ -103,13 +105,13 @@ fn untracked(cameras: &Cameras) -> Cameras {
 }
 
 /// Returns the inputs of all blocks, and the output of the last.
-fn block_inputs<B>(
+fn block_inputs(
     first: Tensor<3>,
-    blocks: &[B],
-    forward: impl Fn(&B, Tensor<3>) -> Tensor<3>,
+    num_blocks: usize,
+    forward: impl Fn(usize, Tensor<3>) -> Tensor<3>,
 ) -> (Vec<Tensor<3>>, Tensor<3>) {
     let mut inputs = vec![first];
-    for block in blocks {
+    for block in 0..num_blocks {
         inputs.push(forward(block, inputs[inputs.len() - 1].clone()));
     }
     let last = inputs.pop().expect("the first input");

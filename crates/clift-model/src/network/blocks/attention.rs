@@ -9,7 +9,7 @@ use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::tokens::Tokens;
-use crate::ops::attention::sdpa::self_sdpa;
+use crate::ops::attention::sdpa::{cross_sdpa, self_sdpa};
 use crate::ops::linear::{linear, norm_linear};
 
 /// Self-attention with a packed projection (paper section 3.1: eight heads).
@@ -52,6 +52,23 @@ impl SelfAttention {
             None => self_sdpa(packed, self.num_heads),
         };
         linear(&self.out_proj, attended)
+    }
+
+    /// Applies `norm`, then attention of the first `count` tokens of a scene to all of them.
+    ///
+    /// # Shapes
+    /// - `x`: `[batch, num_tokens, dim]`
+    /// - returns `[batch, count, dim]`, the first rows of [`forward`](Self::forward)
+    pub fn forward_first(&self, norm: &LayerNorm, x: Tensor<3>, count: usize) -> Tensor<3> {
+        let [_, _, dim] = x.dims();
+        let packed = norm_linear(norm, &self.in_proj, x);
+        let query = packed.clone().narrow(1, 0, count).narrow(2, 0, dim);
+        let key_value = packed.narrow(2, dim, 2 * dim);
+        let (query, key_value) = match &self.qk_norm {
+            Some(qk_norm) => (qk_norm.query(query), qk_norm.key_value(key_value)),
+            None => (query, key_value),
+        };
+        linear(&self.out_proj, cross_sdpa(query, key_value, self.num_heads))
     }
 }
 

@@ -41,6 +41,17 @@ impl EncoderBlock {
         let x = x.clone() + self.attn.forward(&self.norm_attn, x, transforms);
         x.clone() + self.feed_forward.forward(&self.norm_ff, x)
     }
+
+    /// Updates the first `count` tokens of a scene, for a last block whose other tokens nothing reads.
+    ///
+    /// # Shapes
+    /// - `x`: `[batch, num_tokens, dim]`
+    /// - returns `[batch, count, dim]`, the first rows of [`forward`](Self::forward)
+    pub fn forward_first(&self, x: Tensor<3>, count: usize) -> Tensor<3> {
+        let first = x.clone().narrow(1, 0, count);
+        let first = first + self.attn.forward_first(&self.norm_attn, x, count);
+        first.clone() + self.feed_forward.forward(&self.norm_ff, first)
+    }
 }
 
 /// Self-attention among the patches of a target view, cross-attention to the scene's tokens and feed-forward network, each
@@ -101,7 +112,11 @@ impl DecoderBlock {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
+    use crate::network::architecture::CliftVariant;
+    use crate::testing::{
+        Fixture, assert_close, cpu_devices, devices, load_weights, output_and_gradients, random, small_lvsm, to_f64,
+        weight_gradients,
+    };
 
     /// Expects output and gradients of a block of width 16 in f32 to equal those of PyTorch in f64.
     fn assert_equals_pytorch<M: Module>(
@@ -137,5 +152,23 @@ mod tests {
         assert_equals_pytorch("decoder_block", &["x", "memory"], DecoderBlock::new, |block, inputs| {
             block.forward(inputs[0].clone(), block.project_tokens(inputs[1].clone().into()), None)
         });
+    }
+
+    #[test]
+    fn first_rows_equal_those_of_the_whole_block() {
+        for variant in [CliftVariant::Paper, CliftVariant::ReleasedRe10k] {
+            for device in cpu_devices() {
+                let config = small_lvsm(variant);
+                let block = to_f64(EncoderBlock::new(&config, &mut Init::new(3, &device))).train();
+                let [x, cotangent] = [(5, 1), (3, 2)].map(|(rows, seed)| random([2, rows, config.dim], seed, &device));
+                let both = |f: &dyn Fn(Tensor<3>) -> Tensor<3>| {
+                    output_and_gradients([x.clone()], cotangent.clone(), |[x]| f(x))
+                };
+                let (output, [grad]) = both(&|x| block.forward_first(x, 3));
+                let (expected, [expected_grad]) = both(&|x| block.forward(x, None).narrow(1, 0, 3));
+                assert_close(&output, &expected, 1e-12);
+                assert_close(&grad, &expected_grad, 1e-12);
+            }
+        }
     }
 }
