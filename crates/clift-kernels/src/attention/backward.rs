@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::attention::shapes::{AttentionGradients, AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
-use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_rows, pack_transposed};
+use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_panels, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
@@ -126,6 +126,7 @@ impl<'a> ProductKernel for BackwardTask<'a> {
         let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
         let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
         let block = num_keys.min(BACKWARD_KEYS);
+        let key_lanes = lanes_of::<O>(block);
         let score_row = block.next_multiple_of(panel) + ROW_PADDING;
         // Values of f32 have the same layout along as across.
         let only_pairs = |len: usize| if O::PER_LANE > 1 { len } else { 0 };
@@ -137,7 +138,7 @@ impl<'a> ProductKernel for BackwardTask<'a> {
             num_queries,
             block.next_multiple_of(panel) * inner,
             block.next_multiple_of(panel) * inner,
-            lanes_of::<O>(block) * width,
+            key_lanes * width.next_multiple_of(panel),
             block * width,
             block * width,
             QUERY_BLOCK * score_row,
@@ -156,7 +157,7 @@ impl<'a> ProductKernel for BackwardTask<'a> {
             delta,
             keys_t,
             values_t,
-            keys_across,
+            key_panels,
             key_sums,
             value_sums,
             weights,
@@ -182,7 +183,7 @@ impl<'a> ProductKernel for BackwardTask<'a> {
             let rows = first_key..first_key + count;
             pack_transposed::<S, O>(simd, rows_of(inputs.key, rows.clone()), [inner, panel], keys_t);
             pack_transposed::<S, O>(simd, rows_of(inputs.value, rows.clone()), [inner, panel], values_t);
-            pack_across::<S, O>(simd, rows_of(inputs.key, rows), width, keys_across);
+            pack_panels::<S, O>(simd, rows_of(inputs.key, rows), [key_lanes, panel], key_panels);
             key_sums.fill(0.0);
             value_sums.fill(0.0);
             for start in (0..num_queries).step_by(QUERY_BLOCK) {
@@ -210,7 +211,8 @@ impl<'a> ProductKernel for BackwardTask<'a> {
                 let left = Left { values: slopes, row: score_row, step: 1 };
                 let size = [rows, lanes_of::<O>(count), head_width];
                 let to = (&mut grad_query[start * width..], width);
-                multiply::<S, O>(simd, size, left, right(keys_across), to, true);
+                let right = Right { values: key_panels, step: panel, panel: key_lanes * panel };
+                multiply::<S, O>(simd, size, left, right, to, true);
             }
             for (row, (keys, values)) in key_sums.chunks(width).zip(value_sums.chunks(width)).take(count).enumerate() {
                 let index = [scene, first_key + row, head];

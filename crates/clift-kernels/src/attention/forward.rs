@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::attention::shapes::{AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
-use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_rows, pack_transposed};
+use crate::primitives::packing::{lanes_of, pack_in_place, pack_panels, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
@@ -76,9 +76,10 @@ impl<'a> ProductKernel for Forward<'a> {
         let AttentionSizes { num_keys, head_width, .. } = sizes;
         let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
         let score_row = num_keys.min(FORWARD_KEYS).next_multiple_of(panel) + ROW_PADDING;
+        let key_lanes = lanes_of::<O>(num_keys);
         let lens = [
             num_keys.next_multiple_of(panel) * inner,
-            lanes_of::<O>(num_keys) * width,
+            key_lanes * width.next_multiple_of(panel),
             QUERY_BLOCK * inner,
             QUERY_BLOCK * score_row,
             QUERY_BLOCK * width,
@@ -90,7 +91,7 @@ impl<'a> ProductKernel for Forward<'a> {
         let rows_of =
             |rows: StridedRows<'a>, range: Range<usize>| range.map(move |row| rows.head(&sizes, scene, row, head));
         pack_transposed::<S, O>(simd, rows_of(key, 0..num_keys), [inner, panel], keys);
-        pack_across::<S, O>(simd, rows_of(value, 0..num_keys), width, values);
+        pack_panels::<S, O>(simd, rows_of(value, 0..num_keys), [key_lanes, panel], values);
         for start in queries.clone().step_by(QUERY_BLOCK) {
             let rows = QUERY_BLOCK.min(queries.end - start);
             pack_rows::<S, O>(simd, rows_of(query, start..start + rows), inner, block);
@@ -112,7 +113,8 @@ impl<'a> ProductKernel for Forward<'a> {
                     }
                 }
                 let left = Left { values: scores, row: score_row, step: 1 };
-                let right = Right { values: &values[lanes_of::<O>(first_key) * width..], step: width, panel };
+                let values = &values[lanes_of::<O>(first_key) * panel..];
+                let right = Right { values, step: panel, panel: key_lanes * panel };
                 multiply::<S, O>(simd, [rows, lanes_of::<O>(count), head_width], left, right, (sums, width), true);
             }
             for row in 0..rows {

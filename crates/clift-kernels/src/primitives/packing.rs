@@ -51,6 +51,21 @@ pub(crate) fn pack_across<'a, S: Simd, O: Operands>(
     }
 }
 
+/// Packs rows across the inner dimension in panels: `to[panel][lane][column]` with `lanes` lanes and `width` columns a panel,
+/// zeros at the end of the last one. Rows of one panel lie together in the cache.
+#[inline(always)]
+pub(crate) fn pack_panels<'a, S: Simd, O: Operands>(
+    simd: S,
+    rows: impl Iterator<Item = &'a [f32]> + Clone,
+    [lanes, width]: [usize; 2],
+    to: &mut [f32],
+) {
+    for (panel, to) in to.chunks_exact_mut(lanes * width).enumerate() {
+        let columns = rows.clone().map(|row| row.get(panel * width..).unwrap_or_default());
+        pack_across::<S, O>(simd, columns, width, to);
+    }
+}
+
 /// Packs rows along the inner dimension as columns of panels: `to[panel][lane][column]` with `lanes` lanes and `width`
 /// columns a panel, zeros at the end of the last one.
 #[inline(always)]
