@@ -83,6 +83,17 @@ impl Default for DataConfig {
 }
 
 impl DataConfig {
+    /// Returns the same data with half as many columns and rows, also of the frames of synthetic scenes.
+    #[must_use]
+    pub fn at_half_resolution(&self) -> Self {
+        let mut half = self.clone();
+        let Self { width, height, synthetic, .. } = &mut half;
+        for side in [width, height, &mut synthetic.width, &mut synthetic.height] {
+            *side /= 2;
+        }
+        half
+    }
+
     /// Returns the options of reading a clip.
     pub fn clip_options(&self) -> ClipOptions {
         ClipOptions {

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 
 use crate::config::DataConfig;
 use crate::error::DataError;
+use crate::sampling::clip_reader::ClipReader;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
 use crate::sources::dataset_root::DatasetRoot;
@@ -93,6 +94,24 @@ pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<Open
         return Err(DataError::NoScenes { reason: format!("{}: {}", Split::Train, opened.report) });
     }
     Ok(OpenedSource { source: Arc::new(SceneSubset::new(source, long)), ..opened })
+}
+
+/// Returns a reader of the same training scenes as `reader`, which reads the data set of `config`, with half as many columns
+/// and rows.
+///
+/// # Errors
+/// As [`open_dataset`].
+pub fn half_resolution(config: &DataConfig, reader: &ClipReader) -> Result<ClipReader, DataError> {
+    let half = config.at_half_resolution();
+    let source: Arc<dyn SceneSource> = match config.source {
+        // Smaller frames are drawn faster.
+        SourceKind::Synthetic => {
+            let drawn = open_dataset(&half, Split::Train)?.source;
+            Arc::new(SceneSubset::first(drawn, reader.source.num_scenes()))
+        }
+        _ => reader.source.clone(),
+    };
+    Ok(ClipReader { source, options: half.clip_options() })
 }
 
 #[cfg(test)]

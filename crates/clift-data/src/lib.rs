@@ -36,7 +36,7 @@ mod torch;
 
 // Opening a data set.
 pub use config::DataConfig;
-pub use dataset::{open_dataset, open_training_dataset};
+pub use dataset::{half_resolution, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
 pub use scene_source::{SceneSource, Split};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};

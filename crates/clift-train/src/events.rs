@@ -37,9 +37,9 @@ pub struct StepEvent {
     pub step: u64,
     /// The stage.
     pub stage: Stage,
-    /// Number of steps of the stage.
+    /// Last step of the stage, or of the images of half the width and height.
     #[serde(skip)]
-    pub num_steps: u64,
+    pub last_step: u64,
     /// Training loss of the batch.
     pub loss: f64,
     /// PSNR of the batch in dB.
@@ -63,6 +63,17 @@ pub enum Event {
         done: u64,
         /// Number of steps; of context sets for the cluster cache.
         num_steps: u64,
+    },
+    /// The following steps of a stage have images of this size, where a stage has images of two sizes.
+    ImageSize {
+        /// The stage.
+        stage: Stage,
+        /// Columns and rows of an image.
+        size: [usize; 2],
+        /// Steps done before.
+        done: u64,
+        /// Last step with images of this size.
+        last_step: u64,
     },
     /// An update was made.
     Step(StepEvent),

@@ -190,12 +190,18 @@ fn update(
 ) -> Result<PartPlan, TrainError> {
     let PlanOptions { is_timed, num_ranks, .. } = *options;
     let (batch_size, parts) = scenes_of_rank(config, stage, num_ranks);
-    let all = possible_sizes(config, stage)?;
-    let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
-    let macs = batch_size as f64 * macs_of_scene;
+    let mut macs = batch_size as f64 * mean_macs_of_scene(config, stage)?;
+    let mut images = (batch_size * config.data.views.num_targets) as f64;
+    let settings = config.stage(stage);
+    if settings.half_resolution_steps > 0 {
+        // The mean step of the stage.
+        let share = settings.half_resolution_steps as f64 / settings.steps as f64;
+        let half = Config { data: config.data.at_half_resolution(), ..config.clone() };
+        macs = (1.0 - share) * macs + share * batch_size as f64 * mean_macs_of_scene(&half, stage)?;
+        images *= 1.0 - 0.75 * share;
+    }
     let trained_parameters = parameters.of_parts(stage.trained());
     let rates = is_timed.then(|| update_rates(config, stage, &typical_sizes(config, stage)?)).transpose()?;
-    let images = (batch_size * config.data.views.num_targets) as f64;
     let compute_s = rates
         .map(|rates| macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_image);
     let busy_threads = rates.map(|rates| rates.busy);
@@ -208,8 +214,14 @@ fn update(
         let both = sent_bytes(trained_parameters, num_ranks);
         part.sent_bytes = both / 2 * (parts.num_rounds() as u64 + 1);
     }
-    let count = Some(config.stage(stage).steps);
+    let count = Some(settings.steps);
     Ok(PartPlan { unit: "step", count, trained_parameters, compute_s, busy_threads, ..part })
+}
+
+/// Returns the multiply-accumulates of a scene of an update, the mean over all sizes that it can have.
+fn mean_macs_of_scene(config: &Config, stage: Stage) -> Result<f64, TrainError> {
+    let all = possible_sizes(config, stage)?;
+    Ok(all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64)
 }
 
 /// Returns the memory of a sum over ranks: the gradients in one vector, those received, the own range, and the blocks that

@@ -54,6 +54,9 @@ impl Config {
                 return Err(bad(key, "[]", "write at least one count"));
             }
         }
+        if !(0.0..=1.0).contains(&stage1.half_resolution) {
+            return Err(bad("stage1.half_resolution", stage1.half_resolution, "write 0 to 1"));
+        }
         let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {
             return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
@@ -73,6 +76,7 @@ impl Config {
 
     fn validate_size(&self) -> Result<(), TrainError> {
         let patch_size = self.model.patch_size;
+        let half = self.stage1.half_resolution;
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
             if value == 0 || !value.is_multiple_of(patch_size) {
                 let below = value / patch_size * patch_size;
@@ -80,6 +84,10 @@ impl Config {
                     if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
                 let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
                 return Err(bad(key, value, &fix));
+            }
+            if half > 0.0 && !value.is_multiple_of(2 * patch_size) {
+                let fix = format!("half of {key} = {value} is no multiple of model.patch_size = {patch_size}: write 0");
+                return Err(bad("stage1.half_resolution", half, &fix));
             }
         }
         Ok(())
@@ -91,7 +99,8 @@ impl Config {
         if !(weight >= 0.0 && weight.is_finite()) {
             return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
         }
-        let DataConfig { width, height, .. } = self.data;
+        let divisor = if self.stage1.half_resolution > 0.0 { 2 } else { 1 };
+        let [width, height] = [self.data.width, self.data.height].map(|side| side / divisor);
         if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
             let fix = format!(
                 "VGG-19 needs images of at least {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, not {width} x {height}: write 0"

@@ -204,6 +204,9 @@ impl Default for OptimizerConfig {
 pub struct Stage1Config {
     /// Number of optimizer updates.
     pub steps: u64,
+    /// Share of the updates, the first ones, whose images have half the width and height. They take a fraction of the time.
+    /// Validation has whole images.
+    pub half_resolution: f64,
     /// Scenes per update.
     pub batch_size: usize,
     /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them.
@@ -220,6 +223,7 @@ impl Default for Stage1Config {
     fn default() -> Self {
         Self {
             steps: 90_000,
+            half_resolution: 0.0,
             batch_size: 64,
             accumulate: 1,
             keep_tokens: [0.25, 1.0],
@@ -338,7 +342,16 @@ mod tests {
         (config.data.width, config.data.height) = (8, 256);
         assert!(config.validate().unwrap_err().to_string().contains("16 x 16"), "too small for the network");
         (config.data.width, config.data.height) = (256, 256);
+        config.stage1.half_resolution = 0.5;
+        config.data.width = 16;
+        assert!(config.validate().unwrap_err().to_string().contains("not 8 x 128"), "the loss sees the half");
         config.loss.perceptual_weight = 0.0;
+        config.data.width = 264;
+        let message = config.validate().unwrap_err().to_string();
+        assert!(message.starts_with("`stage1.half_resolution` = 0.5: half of data.width = 264 is no"), "{message}");
+        (config.data.width, config.stage1.half_resolution) = (256, 600.0);
+        assert_eq!(config.validate().unwrap_err().to_string(), "`stage1.half_resolution` = 600: write 0 to 1");
+        config.stage1.half_resolution = 0.0;
         assert_eq!(config.loss.weights().expect("no term"), None);
         config.data.views.min_context = 0;
         assert!(config.validate().is_err(), "and no panic");

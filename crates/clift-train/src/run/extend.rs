@@ -1,7 +1,7 @@
 //! `--extend`: trains a stage of an existing run for more steps.
 //!
-//! The steps made so far are kept. The following steps use the learning rates of a run with the new number of steps: the
-//! rate jumps to the cosine of that run and decays to zero at the new end. The result therefore differs from a run that
+//! The steps made so far are kept. The following steps use the learning rates and image sizes of a run with the new number of
+//! steps: the rate jumps to the cosine of that run and decays to zero at the new end. The result therefore differs from a run that
 //! had the new number from the start, and `run.json` records the extension.
 
 use std::path::Path;

@@ -232,7 +232,7 @@ mod tests {
     const STEP: StepEvent = StepEvent {
         step: 1,
         stage: Stage::Stage1,
-        num_steps: 9,
+        last_step: 9,
         loss: f64::NAN,
         psnr: f64::INFINITY,
         lr: 1e-3,

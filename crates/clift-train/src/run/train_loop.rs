@@ -95,6 +95,8 @@ pub(crate) struct TrainLoop<'a> {
     saved: u64,
     validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
+    /// Last step with images of the size that was reported; 0 before the first report.
+    last_step_of_size: u64,
     pub(crate) log: RunLog<'a>,
 }
 
@@ -108,7 +110,7 @@ impl<'a> TrainLoop<'a> {
         stop: &'a AtomicBool,
         log: RunLog<'a>,
     ) -> Self {
-        Self { plan, checkpoints, saved: progress.step, progress, validation, stop, log }
+        Self { plan, checkpoints, saved: progress.step, progress, validation, stop, last_step_of_size: 0, log }
     }
 
     pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
@@ -159,6 +161,7 @@ impl<'a> TrainLoop<'a> {
         }
         let StageSettings { steps: num_steps, optimizer, .. } = self.plan.settings;
         let step = self.progress.step + 1;
+        self.report_size(step);
         let lr = learning_rate(optimizer, step, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
         let mut anomaly = None;
@@ -188,11 +191,25 @@ impl<'a> TrainLoop<'a> {
         Ok(train_state)
     }
 
+    /// Reports the size of the images before the first step of this process and where it changes.
+    fn report_size(&mut self, step: u64) {
+        let StageSettings { stage, half_resolution_steps, .. } = self.plan.settings;
+        let last_step = self.plan.settings.last_step_of_size(step);
+        if half_resolution_steps == 0 || self.last_step_of_size == last_step {
+            return;
+        }
+        self.last_step_of_size = last_step;
+        let data = &self.plan.config.data;
+        let divisor = if step <= half_resolution_steps { 2 } else { 1 };
+        let size = [data.width, data.height].map(|side| side / divisor);
+        self.log.event(&Event::ImageSize { stage, size, done: step - 1, last_step });
+    }
+
     fn report(&mut self, update: Update, lr: f64, started: Instant) {
         self.log.event(&Event::Step(StepEvent {
             stage: self.plan.settings.stage,
             step: self.progress.step,
-            num_steps: self.plan.settings.steps,
+            last_step: self.plan.settings.last_step_of_size(self.progress.step),
             loss: update.loss,
             psnr: psnr_of_mse(update.mse),
             lr,

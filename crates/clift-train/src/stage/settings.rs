@@ -13,6 +13,8 @@ pub struct StageSettings<'a> {
     pub stage: Stage,
     /// Number of optimizer updates.
     pub steps: u64,
+    /// Number of the first updates whose images have half the width and height.
+    pub half_resolution_steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
     /// Number of micro-batches per update, at most the batch size.
@@ -47,6 +49,11 @@ pub fn freeze(stage: Stage, mut model: Clift) -> Clift {
 }
 
 impl StageSettings<'_> {
+    /// Returns the last step whose images have the size of those of `step`, counted from 1.
+    pub fn last_step_of_size(&self, step: u64) -> u64 {
+        if step <= self.half_resolution_steps { self.half_resolution_steps } else { self.steps }
+    }
+
     /// Returns the most scenes of a micro-batch.
     pub fn micro_batch_size(&self) -> usize {
         self.batch_size.div_ceil(self.accumulate)
@@ -60,6 +67,7 @@ impl Config {
         let settings = StageSettings {
             stage,
             steps: stage1.steps,
+            half_resolution_steps: (stage1.half_resolution * stage1.steps as f64) as u64,
             batch_size: stage1.batch_size,
             accumulate: stage1.accumulate,
             optimizer: &stage1.optimizer,
@@ -70,13 +78,16 @@ impl Config {
             // The encoder is frozen. The condenser learns at the full rate, the renderer at 0.1 of it by default.
             Stage::Stage2 => StageSettings {
                 steps: stage2.steps,
+                half_resolution_steps: 0,
                 batch_size: stage2.batch_size,
                 accumulate: stage2.accumulate,
                 optimizer: &stage2.optimizer,
                 renderer_lr_factor: stage2.renderer_lr_factor,
                 ..settings
             },
-            Stage::Clusters | Stage::Eval => StageSettings { steps: 0, batch_size: 1, accumulate: 1, ..settings },
+            Stage::Clusters | Stage::Eval => {
+                StageSettings { steps: 0, half_resolution_steps: 0, batch_size: 1, accumulate: 1, ..settings }
+            }
         }
     }
 

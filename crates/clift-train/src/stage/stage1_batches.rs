@@ -2,20 +2,24 @@
 
 use std::sync::Arc;
 
-use clift_data::{ClipReader, TrainingClips, derive_seed, item_rng, step_rng};
+use clift_data::{ClipReader, ClipViews, TrainingClips, derive_seed, half_resolution, item_rng, step_rng};
+use clift_model::ModelConfig;
 use rand::RngExt;
 use rand::seq::index::sample;
 
 use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
+use crate::events::Stage;
 use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Maker of the batches of stage 1, a pure function of (seed, step).
 pub struct Stage1Batches {
     clips: TrainingClips,
+    /// Clips of the first steps, and the number of these steps.
+    half_resolution: Option<(TrainingClips, u64)>,
     keep_tokens: [f64; 2],
-    tokens_per_view: usize,
+    model: ModelConfig,
     parts: BatchParts,
     seed: u64,
 }
@@ -23,18 +27,26 @@ pub struct Stage1Batches {
 impl Stage1Batches {
     /// Makes batches of the slots that `parts` gives to this rank.
     pub fn new(config: &Config, reader: &ClipReader, parts: BatchParts) -> Result<Self, TrainError> {
+        let Config { data, stage1, .. } = config;
         let seed = derive_seed(config.seed, "stage1");
-        let read = reader.clone();
-        let clips = TrainingClips::new(
-            reader.source.clone(),
-            Arc::new(move |scene, views: &_| read.read(scene, views)),
-            config.data.views.clone(),
-            config.stage1.batch_size,
+        let clips = |reader: &ClipReader| {
+            let read = reader.clone();
+            let read = Arc::new(move |scene, views: &_| read.read(scene, views));
+            let clips = TrainingClips::new(reader.source.clone(), read, data.views.clone(), stage1.batch_size, seed);
+            clips.map(|clips| clips.with_flip(data.flip))
+        };
+        let half_resolution = match config.stage(Stage::Stage1).half_resolution_steps {
+            0 => None,
+            num_steps => Some((clips(&half_resolution(data, reader)?)?, num_steps)),
+        };
+        Ok(Self {
+            clips: clips(reader)?,
+            half_resolution,
+            keep_tokens: stage1.keep_tokens,
+            model: config.model.clone(),
+            parts,
             seed,
-        )?;
-        let clips = clips.with_flip(config.data.flip);
-        let tokens_per_view = config.model.num_patches(1, config.data.height, config.data.width)?;
-        Ok(Self { clips, keep_tokens: config.stage1.keep_tokens, tokens_per_view, parts, seed })
+        })
     }
 
     /// Makes the batch of `step`, counted from 0.
@@ -42,13 +54,20 @@ impl Stage1Batches {
     /// The share of tokens is sampled once per step; every target view gets its own random subset.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let (mut clips, mut skipped) = (Vec::new(), Vec::new());
+        let source = match &self.half_resolution {
+            Some((half, num_steps)) if step < *num_steps => half,
+            _ => &self.clips,
+        };
         for slot in self.parts.slots() {
             let mut of_slot = Vec::new();
-            clips.push(self.clips.slot(step, slot, &mut of_slot)?);
+            clips.push(source.slot(step, slot, &mut of_slot)?);
             skipped.extend(of_slot.into_iter().map(|skip| (slot, skip)));
         }
-        let num_context = clips.first().map_or(0, |clip| clip.context.num_views());
-        let num_tokens = num_context * self.tokens_per_view;
+        let num_tokens = clips.first().map(|clip| {
+            let ClipViews { height, width, .. } = clip.context;
+            self.model.num_patches(clip.context.num_views(), height, width)
+        });
+        let num_tokens = num_tokens.transpose()?.unwrap_or_default();
         let [low, high] = self.keep_tokens;
         let share = low + (high - low) * step_rng(self.seed, step, "kept share").random::<f64>();
         let count = ((num_tokens as f64 * share) as usize).clamp(1, num_tokens.max(1));

@@ -37,7 +37,7 @@ pub struct Bar {
 
 impl Sink for Bar {
     fn event(&mut self, event: &Event) {
-        if matches!(event, Event::StageStarted { .. } | Event::StageFinished { .. })
+        if matches!(event, Event::StageStarted { .. } | Event::ImageSize { .. } | Event::StageFinished { .. })
             && let Some(bar) = self.bar.take()
         {
             bar.finish_and_clear();
@@ -49,8 +49,13 @@ impl Sink for Bar {
             }
         }
         match (event, &self.bar) {
-            (Event::StageStarted { stage, done, num_steps }, _) => {
-                self.bar = Some(progress_bar(stage.name(), *done, *num_steps));
+            // Steps with images of another size take another time.
+            (
+                Event::StageStarted { stage, done, num_steps: last }
+                | Event::ImageSize { stage, done, last_step: last, .. },
+                _,
+            ) => {
+                self.bar = Some(progress_bar(stage.name(), *done, *last));
             }
             (Event::Step(step), Some(bar)) => {
                 bar.set_message(step_metrics(step));

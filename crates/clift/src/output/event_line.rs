@@ -20,6 +20,9 @@ pub(crate) fn event_line(event: &Event) -> Option<String> {
         Event::StageStarted { stage, done, num_steps } => {
             format!("{}: resumed after {done} of {num_steps} {}", stage.name(), unit(*stage))
         }
+        Event::ImageSize { stage, size: [width, height], last_step, .. } => {
+            format!("{}: images of {width} x {height} pixels to step {last_step}", stage.name())
+        }
         Event::StageFinished { stage, elapsed_s } => format!("{}: done in {}", stage.name(), duration(*elapsed_s)),
         Event::Evaluated { stage, step, psnr, ssim, num_views } => {
             let ssim = ssim.map(|ssim| format!(", SSIM {ssim:.3}")).unwrap_or_default();
@@ -38,7 +41,7 @@ pub(crate) mod tests {
 
     /// An update of stage 1.
     pub(crate) fn step(step: u64, step_s: f64) -> Event {
-        let (stage, num_steps) = (Stage::Stage1, 100);
-        Event::Step(StepEvent { stage, step, num_steps, loss: 0.0123, psnr: 21.5, lr: 4e-4, grad_norm: 1.0, step_s })
+        let (stage, last_step) = (Stage::Stage1, 100);
+        Event::Step(StepEvent { stage, step, last_step, loss: 0.0123, psnr: 21.5, lr: 4e-4, grad_norm: 1.0, step_s })
     }
 }

@@ -30,17 +30,17 @@ impl<W: Write> PlainLines<W> {
     fn step_line(&mut self, event: &StepEvent) -> Option<String> {
         self.pace = (self.pace.0 + 1, self.pace.1 + event.step_s);
         self.since_line_s += event.step_s;
-        let is_due = self.pace.0 == 1 || event.step == event.num_steps || self.since_line_s >= self.interval_s;
+        let is_due = self.pace.0 == 1 || event.step == event.last_step || self.since_line_s >= self.interval_s;
         if !is_due {
             return None;
         }
         self.since_line_s = 0.0;
         let mean_step_s = self.pace.1 / self.pace.0 as f64;
-        let left = duration(mean_step_s * event.num_steps.saturating_sub(event.step) as f64);
-        let (name, step, num_steps) = (event.stage.name(), event.step, event.num_steps);
-        let width = num_steps.to_string().len();
+        let left = duration(mean_step_s * event.last_step.saturating_sub(event.step) as f64);
+        let (name, step, last_step) = (event.stage.name(), event.step, event.last_step);
+        let width = last_step.to_string().len();
         Some(format!(
-            "{name} {step:>width$}/{num_steps}  {}  {mean_step_s:.3} s/step, {left} left",
+            "{name} {step:>width$}/{last_step}  {}  {mean_step_s:.3} s/step, {left} left",
             step_metrics(event)
         ))
     }
@@ -58,7 +58,7 @@ impl<W: Write> Sink for PlainLines<W> {
             }
             _ => event_line(event),
         };
-        if matches!(event, Event::StageStarted { .. }) {
+        if matches!(event, Event::StageStarted { .. } | Event::ImageSize { .. }) {
             (self.pace, self.since_line_s, self.printed_tenth) = ((0, 0.0), 0.0, 0);
         }
         if let Some(line) = line {
@@ -101,6 +101,7 @@ stage1: done in 25 s
     fn events_are_printed_at_once() {
         let events = [
             Event::StageStarted { stage: Stage::Stage2, done: 40, num_steps: 100 },
+            Event::ImageSize { stage: Stage::Stage1, size: [32, 16], done: 0, last_step: 60 },
             Event::Evaluated { stage: Stage::Stage2, step: 50, psnr: 24.309, ssim: None, num_views: 12 },
             Event::Checkpoint { path: "runs/tiny/stage2/step-50".into() },
             Event::Skipped { key: "room".into(), reason: "3 frames".into() },
@@ -108,6 +109,7 @@ stage1: done in 25 s
             Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: 7 },
         ];
         let expected = "stage2: resumed after 40 of 100 steps
+stage1: images of 32 x 16 pixels to step 60
 stage2 step 50: 24.31 dB over 12 validation views
 saved runs/tiny/stage2/step-50
 skipped room: 3 frames

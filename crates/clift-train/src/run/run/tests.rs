@@ -6,9 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde_json::Value;
 
 use super::*;
+use crate::config::config::Stage1Config;
 use crate::config::parse::read_config;
 use crate::distributed::testing::on_threads;
 use crate::events::StepEvent;
+use crate::step::batch::BatchTokens;
 use crate::testing::fixture;
 
 /// The micro run in `folder`, with changed keys.
@@ -142,8 +144,10 @@ fn more_ranks_than_scenes_train_like_fewer() {
     assert_same(&three, &one);
 }
 
-const LONG: [&str; 6] = [
+/// One of the interruptions is at the change of the resolution.
+const LONG: [&str; 7] = [
     "stage1.steps=24",
+    "stage1.half_resolution=0.55",
     "stage2.steps=12",
     "stage1.batch_size=4",
     "stage2.batch_size=4",
@@ -175,6 +179,41 @@ fn interrupted_runs_resume_on_any_number_of_ranks() {
     interrupted(3, 2, Stage::Stage2, 7);
     train_whole(2, &config);
     assert_same(&parts, &whole);
+}
+
+#[test]
+fn first_batches_have_half_the_resolution_and_the_same_views() {
+    let place = tempfile::tempdir().expect("a folder");
+    let mut sizes = Vec::new();
+    let mut sink = |event: &Event| {
+        if let Event::ImageSize { size, done, last_step, .. } = event {
+            sizes.push((*size, *done, *last_step));
+        }
+    };
+    let run = Run::open(micro(place.path(), &LONG), &RunOptions::default(), &mut sink).expect("valid");
+    let opened = open_training_dataset(&run.config.data, run.config.stage1.steps).expect("rooms");
+    let reader = run.reader(opened, Split::Train, &mut sink).expect("readable");
+    let whole =
+        Config { stage1: Stage1Config { half_resolution: 0.0, ..run.config.stage1.clone() }, ..run.config.clone() };
+    let batches = |config| Stage1Batches::new(config, &reader, run.parts(Stage::Stage1)).expect("valid");
+    let (batches, whole) = (batches(&run.config), batches(&whole));
+    for (step, divisor) in [(0, 2), (12, 2), (13, 1), (23, 1)] {
+        let (found, whole) = (batches.batch(step).expect("readable"), whole.batch(step).expect("readable"));
+        for (clip, whole) in found.clips.iter().zip(&whole.clips) {
+            for (views, whole) in [(&clip.context, &whole.context), (&clip.target, &whole.target)] {
+                assert_eq!((views.width, views.height), (16 / divisor, 16 / divisor), "step {step}");
+                assert_eq!((&views.frame_index, &views.c2w), (&whole.frame_index, &whole.c2w));
+                assert_eq!(views.intrinsics[0].fx * divisor as f64, whole.intrinsics[0].fx);
+            }
+        }
+        // Ids of tokens that exist: one patch of 8 pixels for each of two views, or four.
+        if let BatchTokens::Subsets(subsets) = &found.tokens {
+            let num_tokens = 2 * (2 / divisor as u32).pow(2);
+            assert!(subsets.iter().flatten().flatten().all(|&token| token < num_tokens));
+        }
+    }
+    run.train(Some(Stage::Stage1), &AtomicBool::new(false), &mut sink).expect("trains");
+    assert_eq!(sizes, [([8, 8], 0, 13), ([16, 16], 13, 24)]);
 }
 
 #[test]
