@@ -40,7 +40,8 @@ class Figure:
 
     def train(self, kind: str, name: str, seed: int, *changes: str) -> Path:
         run = self.out / name
-        changes = (f"run_dir={json.dumps(str(run))}", f"seed={seed}", *changes, *self.set)
+        # Steps of one kind: LVSM-ED's equal time is counted in them.
+        changes = (f"run_dir={json.dumps(str(run))}", f"seed={seed}", "stage1.half_resolution=0", *changes, *self.set)
         self.clift("train", str(self.configs[kind]), *(word for change in changes for word in ("--set", change)))
         return run
 

@@ -71,6 +71,7 @@ def main() -> None:
             *options.set,
             f'run_dir="{run}"',
             f"stage1.steps={options.steps}",
+            "stage1.half_resolution=0",
             f"stage2.steps={options.steps}",
             f"clusters.num_scenes={options.scenes}",
             f"eval.num_scenes={options.scenes}",
