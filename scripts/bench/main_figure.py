@@ -30,7 +30,8 @@ FORMATS = ["f16", "coded", "coded-0.1"]
 
 class Figure:
     def __init__(self, args: argparse.Namespace):
-        self.exe, self.out, self.set = args.exe.resolve(), args.out.resolve(), args.set
+        self.exe, self.out = args.exe.resolve(), args.out.resolve()
+        self.set = {"clift": [*args.clift_set, *args.set], "lvsm": args.set}
         self.configs = {"clift": args.clift_config, "lvsm": args.lvsm_config}
 
     def clift(self, *words: str) -> None:
@@ -41,7 +42,7 @@ class Figure:
     def train(self, kind: str, name: str, seed: int, *changes: str) -> Path:
         run = self.out / name
         # Steps of one kind: LVSM-ED's equal time is counted in them.
-        changes = (f"run_dir={json.dumps(str(run))}", f"seed={seed}", "stage1.half_resolution=0", *changes, *self.set)
+        changes = (f"run_dir={json.dumps(str(run))}", f"seed={seed}", "stage1.half_resolution=0", *changes, *self.set[kind])
         self.clift("train", str(self.configs[kind]), *(word for change in changes for word in ("--set", change)))
         return run
 
@@ -123,6 +124,7 @@ def main() -> None:
     parser.add_argument("--latents", default="64,256,1024", help="numbers of latents, the smallest first")
     parser.add_argument("--seeds", default="0,1,2", help="the first trains every size, the others the smallest")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=TOML", help="changes both configs")
+    parser.add_argument("--clift-set", action="append", default=[], metavar="KEY=TOML", help="changes CLiFT's config")
     args = parser.parse_args()
     figure, latents = Figure(args), [int(count) for count in args.latents.split(",")]
     evaluations: dict[str, list[list[dict]]] = {"steps": [], "time": []}
