@@ -161,14 +161,15 @@ fn seconds_per_unit(compute_s: f64, loading_s: f64, num_threads: usize, shared: 
     (compute_s + added_s).max(loading_s / num_threads as f64)
 }
 
-/// Does [`Config::validate`] without requiring `data.root`.
+/// Does [`Config::validate`] and [`Config::validate_half_resolution`] without requiring `data.root`.
 ///
 /// # Errors
-/// As [`Config::validate`].
+/// As both.
 pub fn check_plan(config: &Config) -> Result<(), TrainError> {
     let mut config = config.clone();
     config.data.root.get_or_insert_with(Default::default);
-    config.validate()
+    config.validate()?;
+    config.validate_half_resolution()
 }
 
 /// Lists the weight files that training or evaluation needs and does not find. A plan does without them.

@@ -76,7 +76,6 @@ impl Config {
 
     fn validate_size(&self) -> Result<(), TrainError> {
         let patch_size = self.model.patch_size;
-        let half = self.stage1.half_resolution;
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
             if value == 0 || !value.is_multiple_of(patch_size) {
                 let below = value / patch_size * patch_size;
@@ -85,10 +84,32 @@ impl Config {
                 let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
                 return Err(bad(key, value, &fix));
             }
-            if half > 0.0 && !value.is_multiple_of(2 * patch_size) {
-                let fix = format!("half of {key} = {value} is no multiple of model.patch_size = {patch_size}: write 0");
-                return Err(bad("stage1.half_resolution", half, &fix));
-            }
+        }
+        Ok(())
+    }
+
+    /// Checks that stage 1 can train on images of half the width and height, if it does. For a training alone: evaluation and
+    /// rendering have no such images.
+    ///
+    /// # Errors
+    /// [`TrainError::BadConfig`] if half an image has no whole number of patches or is too small for the perceptual loss.
+    pub fn validate_half_resolution(&self) -> Result<(), TrainError> {
+        let (half, multiple) = (self.stage1.half_resolution, 2 * self.model.patch_size);
+        if half == 0.0 {
+            return Ok(());
+        }
+        for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
+            let fix = if !value.is_multiple_of(multiple) {
+                format!("write 0, or a multiple of 2 x model.patch_size = {multiple} as {key}, not {value}")
+            } else if self.loss.perceptual_weight > 0.0 && value / 2 < PERCEPTUAL_MIN_SIZE_PX {
+                let least = 2 * PERCEPTUAL_MIN_SIZE_PX;
+                format!(
+                    "write 0, or {least} or more as {key}, not {value}: VGG-19 needs {PERCEPTUAL_MIN_SIZE_PX} pixels"
+                )
+            } else {
+                continue;
+            };
+            return Err(bad("stage1.half_resolution", half, &fix));
         }
         Ok(())
     }
@@ -99,8 +120,7 @@ impl Config {
         if !(weight >= 0.0 && weight.is_finite()) {
             return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
         }
-        let divisor = if self.stage1.half_resolution > 0.0 { 2 } else { 1 };
-        let [width, height] = [self.data.width, self.data.height].map(|side| side / divisor);
+        let (width, height) = (self.data.width, self.data.height);
         if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
             let fix = format!(
                 "VGG-19 needs images of at least {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, not {width} x {height}: write 0"

@@ -76,6 +76,7 @@ impl Run {
             config.data.hold_out = 0;
         }
         config.validate()?;
+        config.validate_half_resolution()?;
         let (device, places) = open_device(config.device, &ranks)?;
         for place in places {
             sink.event(&Event::Message(place));
