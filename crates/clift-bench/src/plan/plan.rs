@@ -164,7 +164,7 @@ fn seconds_per_unit(compute_s: f64, loading_s: f64, num_threads: usize, shared: 
 /// Does [`Config::validate`] and [`Config::validate_half_resolution`] without requiring `data.root`.
 ///
 /// # Errors
-/// As both.
+/// Those of both.
 pub fn check_plan(config: &Config) -> Result<(), TrainError> {
     let mut config = config.clone();
     config.data.root.get_or_insert_with(Default::default);

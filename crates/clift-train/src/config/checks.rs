@@ -88,28 +88,27 @@ impl Config {
         Ok(())
     }
 
-    /// Checks that stage 1 can train on images of half the width and height, if it does. For a training alone: evaluation and
-    /// rendering have no such images.
+    /// Checks that images of half the width and height have a size that stage 1 can train on, if `stage1.half_resolution` is
+    /// above 0. [`Self::validate`] does not: a trained model is used without such images.
     ///
     /// # Errors
-    /// [`TrainError::BadConfig`] if half an image has no whole number of patches or is too small for the perceptual loss.
+    /// [`TrainError::BadConfig`] if half of a side has no whole number of patches or is too short for the perceptual loss.
     pub fn validate_half_resolution(&self) -> Result<(), TrainError> {
-        let (half, multiple) = (self.stage1.half_resolution, 2 * self.model.patch_size);
+        let half = self.stage1.half_resolution;
         if half == 0.0 {
             return Ok(());
         }
+        let (multiple, least) = (2 * self.model.patch_size, 2 * PERCEPTUAL_MIN_SIZE_PX);
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
-            let fix = if !value.is_multiple_of(multiple) {
-                format!("write 0, or a multiple of 2 x model.patch_size = {multiple} as {key}, not {value}")
-            } else if self.loss.perceptual_weight > 0.0 && value / 2 < PERCEPTUAL_MIN_SIZE_PX {
-                let least = 2 * PERCEPTUAL_MIN_SIZE_PX;
-                format!(
-                    "write 0, or {least} or more as {key}, not {value}: VGG-19 needs {PERCEPTUAL_MIN_SIZE_PX} pixels"
-                )
-            } else {
-                continue;
-            };
-            return Err(bad("stage1.half_resolution", half, &fix));
+            if !value.is_multiple_of(multiple) {
+                let fix = format!("write 0, or a multiple of 2 x model.patch_size = {multiple} as {key}, not {value}");
+                return Err(bad("stage1.half_resolution", half, &fix));
+            }
+            if self.loss.perceptual_weight > 0.0 && value < least {
+                let needs = format!("VGG-19 needs {PERCEPTUAL_MIN_SIZE_PX} pixels");
+                let fix = format!("write 0, or {least} or more as {key}, not {value}: {needs}");
+                return Err(bad("stage1.half_resolution", half, &fix));
+            }
         }
         Ok(())
     }

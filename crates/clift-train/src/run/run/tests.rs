@@ -214,6 +214,10 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
     }
     run.train(Some(Stage::Stage1), &AtomicBool::new(false), &mut sink).expect("trains");
     assert_eq!(sizes, [([8, 8], 0, 13), ([16, 16], 13, 24)]);
+
+    let narrow = micro(&place.path().join("narrow"), &[&LONG[..], &["data.width=8"]].concat());
+    let message = Run::open(narrow, &RunOptions::default(), &mut |_: &Event| {}).map(drop).unwrap_err().to_string();
+    assert!(message.starts_with("`stage1.half_resolution` = 0.55: write 0, or a multiple of"), "{message}");
 }
 
 #[test]
