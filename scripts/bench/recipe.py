@@ -78,7 +78,8 @@ class Bench:
             self.train(run, [*VARIANTS[name], f"stage1.steps={TIMED_STEPS}", "eval.every=0"], None)
         rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         times = [row["step_s"] for row in rows if "step_s" in row]
-        num_half = int(tomllib.loads((run / "config.toml").read_text())["stage1"]["half_resolution"] * TIMED_STEPS)
+        stage1 = tomllib.loads((run / "config.toml").read_text())["stage1"]
+        num_half = round(stage1.get("half_resolution", 0) * TIMED_STEPS)
         parts = [part for part in (times[:num_half], times[num_half:]) if part]
         return sum(len(part) * statistics.median(part[5:]) for part in parts) / TIMED_STEPS
 

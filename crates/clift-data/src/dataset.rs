@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::sampling::clip_reader::ClipReader;
+use crate::sampling::training_clips::ReadClip;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
 use crate::sources::dataset_root::DatasetRoot;
@@ -96,31 +97,62 @@ pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<Open
     Ok(OpenedSource { source: Arc::new(SceneSubset::new(source, long)), ..opened })
 }
 
-/// Returns a reader of the same training scenes as `reader`, which reads the data set of `config`, with half as many columns
-/// and rows.
+/// Returns what reads the clips of `reader`, training scenes of the data set of `config`, with half as many columns and rows.
+///
+/// Images are reduced after they are fitted to the whole size. Synthetic scenes that need no crop are drawn at half the size,
+/// which is faster.
 ///
 /// # Errors
-/// As [`open_dataset`].
-pub fn half_resolution(config: &DataConfig, reader: &ClipReader) -> Result<ClipReader, DataError> {
-    let half = config.at_half_resolution();
-    let source: Arc<dyn SceneSource> = match config.source {
-        // Smaller frames are drawn faster.
-        SourceKind::Synthetic => {
-            let drawn = open_dataset(&half, Split::Train)?.source;
-            Arc::new(SceneSubset::first(drawn, reader.source.num_scenes()))
-        }
-        _ => reader.source.clone(),
-    };
-    Ok(ClipReader { source, options: half.clip_options() })
+/// [`DataError::BadConfig`] for synthetic scenes too small to halve.
+pub fn half_resolution_clips(config: &DataConfig, reader: &ClipReader) -> Result<Arc<ReadClip>, DataError> {
+    let SyntheticConfig { width, height, .. } = config.synthetic;
+    let is_even = width.is_multiple_of(2) && height.is_multiple_of(2);
+    if config.source == SourceKind::Synthetic && is_even && width * config.height == height * config.width {
+        let half = config.at_half_resolution();
+        let source = SyntheticSource::new(SyntheticConfig { split: Split::Train, ..half.synthetic.clone() })?;
+        let drawn = ClipReader { source: Arc::new(source), options: half.clip_options() };
+        return Ok(Arc::new(move |scene, views| drawn.read(scene, views)));
+    }
+    let whole = reader.clone();
+    Ok(Arc::new(move |scene, views| Ok(whole.read(scene, views)?.at_half_resolution())))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::random::item_rng;
+    use crate::sampling::clip::ViewIndices;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
     use crate::testing::rooms;
+
+    #[test]
+    fn small_synthetic_clips_show_what_reduced_ones_show() {
+        let views = ViewIndices { context: vec![0, 7], target: vec![3] };
+        let mut data = DataConfig { width: 32, height: 16, ..DataConfig::default() };
+        let scene = &mut data.synthetic;
+        (scene.num_scenes, scene.num_frames, scene.width, scene.height) = (2, 8, 64, 32);
+        let read = |data: &DataConfig| {
+            let source = open_dataset(data, Split::Train).unwrap().source;
+            let reader = ClipReader { source, options: data.clip_options() };
+            let half = half_resolution_clips(data, &reader).unwrap();
+            (half(1, &views).unwrap(), reader.read(1, &views).unwrap().at_half_resolution())
+        };
+        let (drawn, reduced) = read(&data);
+        assert_eq!((drawn.key, drawn.target.width, drawn.target.height), (reduced.key, 16, 8));
+        for (drawn, reduced) in [(&drawn.context, &reduced.context), (&drawn.target, &reduced.target)] {
+            assert_eq!((&drawn.c2w, &drawn.frame_index), (&reduced.c2w, &reduced.frame_index));
+            assert_eq!(drawn.intrinsics, reduced.intrinsics);
+            let differences = drawn.images.iter().zip(&reduced.images).map(|(a, b)| f64::from(a.abs_diff(*b)));
+            let mean = differences.sum::<f64>() / drawn.images.len() as f64;
+            assert!(mean < 4.0, "{mean} grey levels");
+        }
+        assert_ne!(drawn.target.images, reduced.target.images);
+        // Half of an odd size or margin would have other intrinsics.
+        data.synthetic.height = 36;
+        let (read_half, reduced) = read(&data);
+        assert_eq!(read_half, reduced);
+    }
 
     #[test]
     fn training_skips_scenes_too_short_for_its_last_step() {

@@ -37,9 +37,12 @@ pub struct StepEvent {
     pub step: u64,
     /// The stage.
     pub stage: Stage,
-    /// Last step of the stage, or of the images of half the width and height.
+    /// Last step of the stage.
     #[serde(skip)]
     pub last_step: u64,
+    /// Last step whose images have the size of this one's; the last step of the stage, where they all have one size.
+    #[serde(skip)]
+    pub last_step_of_size: u64,
     /// Training loss of the batch.
     pub loss: f64,
     /// PSNR of the batch in dB.
@@ -73,6 +76,8 @@ pub enum Event {
         /// Steps done before.
         done: u64,
         /// Last step with images of this size.
+        last_step_of_size: u64,
+        /// Last step of the stage.
         last_step: u64,
     },
     /// An update was made.

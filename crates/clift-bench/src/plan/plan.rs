@@ -106,9 +106,14 @@ pub fn plan(config: &Config, options: &PlanOptions) -> Result<Plan, TrainError> 
         parts,
     };
     let per_view_s = if is_timed { loading_s(config) } else { None };
+    // Photos are read at the whole size and then reduced; small images of synthetic scenes are drawn faster.
+    let is_synthetic = config.data.source == SourceKind::Synthetic;
+    let drawn = if is_timed && is_synthetic { sizes(config, Stage::Stage1) } else { Vec::new() };
+    let of_stage1 = drawn.iter().map(|(share, config)| Some(share * loading_s(config)?)).sum::<Option<f64>>();
     for part in &mut plan.parts {
         let (num_views, num_threads) = views_and_threads(config, part.part, num_ranks);
-        part.loading_s = per_view_s.map(|seconds| seconds * num_views);
+        let is_drawn = part.part == Stage::Stage1.name() && !drawn.is_empty();
+        part.loading_s = if is_drawn { of_stage1 } else { per_view_s }.map(|seconds| seconds * num_views);
         part.seconds = part.compute_s.map(|compute| {
             let busy = part.busy_threads.filter(|_| config.device.is_cpu());
             let shared = busy.map(|busy| SharedCores { cores: plan.threads as f64, busy });
@@ -191,21 +196,20 @@ fn update(
 ) -> Result<PartPlan, TrainError> {
     let PlanOptions { is_timed, num_ranks, .. } = *options;
     let (batch_size, parts) = scenes_of_rank(config, stage, num_ranks);
-    let mut macs = batch_size as f64 * mean_macs_of_scene(config, stage)?;
-    let mut images = (batch_size * config.data.views.num_targets) as f64;
-    let settings = config.stage(stage);
-    if settings.half_resolution_steps > 0 {
-        // The mean step of the stage.
-        let share = settings.half_resolution_steps as f64 / settings.steps as f64;
-        let half = Config { data: config.data.at_half_resolution(), ..config.clone() };
-        macs = (1.0 - share) * macs + share * batch_size as f64 * mean_macs_of_scene(&half, stage)?;
-        images *= 1.0 - 0.75 * share;
-    }
+    let images = (batch_size * config.data.views.num_targets) as f64;
     let trained_parameters = parameters.of_parts(stage.trained());
-    let rates = is_timed.then(|| update_rates(config, stage, &typical_sizes(config, stage)?)).transpose()?;
-    let compute_s = rates
-        .map(|rates| macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_image);
-    let busy_threads = rates.map(|rates| rates.busy);
+    let (mut macs, mut compute_s, mut busy_threads) = (0.0, is_timed.then_some(0.0), is_timed.then_some(0.0));
+    // The mean step of the stage. Small images take more time per operation, and so are timed on their own.
+    for (share, config) in sizes(config, stage) {
+        let macs_of_size = batch_size as f64 * mean_macs_of_scene(&config, stage)?;
+        macs += share * macs_of_size;
+        if let (Some(compute_s), Some(busy_threads)) = (&mut compute_s, &mut busy_threads) {
+            let rates = update_rates(&config, stage, &typical_sizes(&config, stage)?)?;
+            let fixed_s = trained_parameters as f64 * rates.per_parameter + images * rates.per_image;
+            *compute_s += share * (macs_of_size * rates.per_mac + fixed_s);
+            *busy_threads += share * rates.busy;
+        }
+    }
     let mut of_rank = config.clone();
     of_rank.set_accumulate(stage, parts.num_parts());
     let mut part = untimed(&of_rank, stage, macs)?;
@@ -215,8 +219,17 @@ fn update(
         let both = sent_bytes(trained_parameters, num_ranks);
         part.sent_bytes = both / 2 * (parts.num_rounds() as u64 + 1);
     }
-    let count = Some(settings.steps);
+    let count = Some(config.stage(stage).steps);
     Ok(PartPlan { unit: "step", count, trained_parameters, compute_s, busy_threads, ..part })
+}
+
+/// Returns the config for every size of the images of a stage, with its share of the steps.
+fn sizes(config: &Config, stage: Stage) -> Vec<(f64, Config)> {
+    let StageSettings { steps, half_resolution_steps, .. } = config.stage(stage);
+    let half = half_resolution_steps as f64 / steps.max(1) as f64;
+    let small = Config { data: config.data.at_half_resolution(), ..config.clone() };
+    let sizes = [(1.0 - half, config.clone()), (half, small)];
+    sizes.into_iter().filter(|(share, _)| *share > 0.0).collect()
 }
 
 /// Returns the multiply-accumulates of a scene of an update, the mean over all sizes that it can have.
@@ -410,6 +423,19 @@ mod tests {
     }
 
     #[test]
+    fn a_step_costs_the_mean_of_whole_and_half_images() {
+        let of = |half_resolution: f64, width: usize| {
+            let mut config = config();
+            (config.data.width, config.data.height) = (width, width);
+            (config.stage1.steps, config.stage1.half_resolution) = (100, half_resolution);
+            plan(&config, &UNTIMED).expect("valid").parts[0].gmacs
+        };
+        let expected = 0.29 * of(0.0, 128) + 0.71 * of(0.0, 256);
+        assert!((of(0.29, 256) / expected - 1.0).abs() < 1e-9, "{} {expected}", of(0.29, 256));
+        assert_eq!(of(1.0, 256), of(0.0, 128));
+    }
+
+    #[test]
     fn small_runs_are_timed_on_cpu_devices() {
         let mut config = config();
         (config.data.width, config.data.height) = (16, 16);
@@ -418,9 +444,12 @@ mod tests {
         config.clusters.grid = vec![TokenCount::Share(0.25), TokenCount::Share(0.5)];
         config.loss.perceptual_weight = 0.5;
         config.eval.lpips_weights = Some("no/such/file".into());
-        for device in [DeviceName::Flex, DeviceName::Ndarray] {
+        let mut half = config.clone();
+        (half.stage1.half_resolution, half.loss.perceptual_weight) = (0.5, 0.0);
+        for (device, config) in [(DeviceName::Flex, &config), (DeviceName::Ndarray, &config), (DeviceName::Flex, &half)]
+        {
             let config = Config { device, ..config.clone() };
-            assert_eq!(missing_weights(&config).len(), 2);
+            assert_eq!(missing_weights(&config).len(), if config.loss.perceptual_weight > 0.0 { 2 } else { 1 });
             let plan = plan(&config, &PlanOptions { is_timed: true, ..UNTIMED }).expect("runs without weight files");
             for part in plan.parts {
                 let seconds = part.seconds.expect("timed");

@@ -6,6 +6,7 @@
 //! - `clip`: view indices, views, clips
 //! - `clip_reader`: reads frames of a scene as a clip
 //! - `flip`: mirrored clips
+//! - `half_resolution`: clips with half the columns and rows
 //! - `scene_order`: seeded permutation per epoch
 //! - `inner_views`: contexts between two ends
 //! - `view_sampler`: context and target frames of an item
@@ -18,6 +19,7 @@ pub(crate) mod clip;
 pub(crate) mod clip_reader;
 pub(crate) mod evaluation_index;
 pub(crate) mod flip;
+pub(crate) mod half_resolution;
 pub(crate) mod inner_views;
 pub(crate) mod prefetcher;
 pub(crate) mod scene_order;

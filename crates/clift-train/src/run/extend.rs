@@ -4,13 +4,11 @@
 //! steps: the rate jumps to the cosine of that run and decays to zero at the new end. The result therefore differs from a run that
 //! had the new number from the start, and `run.json` records the extension.
 
-use std::path::Path;
-
 use clift_model::TokenCodec;
 use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::checkpoints::Checkpoints;
-use crate::config::config::CheckpointConfig;
+use crate::config::config::{CheckpointConfig, Config};
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 
@@ -36,9 +34,11 @@ pub(crate) struct ExtensionRecord {
 }
 
 impl StepExtension {
-    /// Prepares the stage of the run in `folder` for more steps. Weights of a finished stage are renamed.
-    pub fn apply(self, folder: &Path, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
+    /// Prepares the stage of the run of `config`, which has the new number, for more steps. Weights of a finished stage are
+    /// renamed.
+    pub fn apply(self, config: &Config, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
         let Self { stage, from, to } = self;
+        let folder = &config.run_dir;
         let refuse = |fix: &str| bad("--extend", format!("{}.steps {from} -> {to}", stage.name()), fix);
         let later = ["clusters", "stage2"].into_iter().find(|name| folder.join(name).exists());
         if let (Stage::Stage1, Some(later)) = (stage, later) {
@@ -49,6 +49,18 @@ impl StepExtension {
         }
         let own = folder.join(stage.name());
         let newest = Checkpoints::new(own.join("checkpoints"), CheckpointConfig::default()).newest_step()?;
+        let at_step = newest.unwrap_or(0);
+        if stage == Stage::Stage1 {
+            let [half_from, half_to] = [from, to].map(|steps| config.stage1.half_resolution_steps(steps));
+            if half_from < at_step && at_step < half_to {
+                let most = ((at_step as f64 + 0.5) / config.stage1.half_resolution).ceil() as u64 - 1;
+                let fix = format!(
+                    "images would have half the width and height again (stage1.half_resolution): write at most {most}, or \
+                     start a new run with stage1.init_from"
+                );
+                return Err(refuse(&fix));
+            }
+        }
         let weights = own.join("model.safetensors");
         if weights.exists() {
             if newest.is_none() {
@@ -65,7 +77,6 @@ impl StepExtension {
             std::fs::rename(&weights, &kept).map_err(TrainError::io("renaming the former weights", &weights))?;
             sink.event(&Event::Message(format!("kept the weights of {from} steps as {}", kept.display())));
         }
-        let at_step = newest.unwrap_or(0);
         sink.event(&Event::Message(format!(
             "{} is extended from {from} to {to} steps: the steps after {at_step} use the learning rates of {to} steps",
             stage.name()

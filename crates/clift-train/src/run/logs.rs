@@ -233,6 +233,7 @@ mod tests {
         step: 1,
         stage: Stage::Stage1,
         last_step: 9,
+        last_step_of_size: 9,
         loss: f64::NAN,
         psnr: f64::INFINITY,
         lr: 1e-3,

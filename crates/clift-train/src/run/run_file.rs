@@ -126,7 +126,7 @@ pub(crate) fn open_folder(
         let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
         file.extended = found.extended;
         for extension in extensions {
-            file.extended.push(extension.apply(folder, sink)?);
+            file.extended.push(extension.apply(&config, sink)?);
         }
     }
     file.write(folder)?;

@@ -9,6 +9,7 @@ use clift_model::{Clift, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, Progress};
+use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
@@ -23,7 +24,7 @@ use crate::step::batch::StageBatch;
 use crate::step::loss::{Loss, psnr_of_mse};
 use crate::step::loss_scale::LossScale;
 use crate::step::schedule::learning_rate;
-use crate::step::step_guard::{BatchScenes, SkippedStep, StepAnomaly};
+use crate::step::step_guard::{BatchScenes, LossHistory, SkippedStep, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
 
 impl StagePlan<'_> {
@@ -95,7 +96,8 @@ pub(crate) struct TrainLoop<'a> {
     saved: u64,
     validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
-    /// Last step with images of the size that was reported; 0 before the first report.
+    batch_wait: BatchWait,
+    /// Last step with images of the present size; 0 before the first step of this process.
     last_step_of_size: u64,
     pub(crate) log: RunLog<'a>,
 }
@@ -110,18 +112,19 @@ impl<'a> TrainLoop<'a> {
         stop: &'a AtomicBool,
         log: RunLog<'a>,
     ) -> Self {
-        Self { plan, checkpoints, saved: progress.step, progress, validation, stop, last_step_of_size: 0, log }
+        let (saved, batch_wait) = (progress.step, BatchWait::new());
+        Self { plan, checkpoints, saved, progress, validation, stop, batch_wait, last_step_of_size: 0, log }
     }
 
     pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
         let mut batches = self.plan.prefetch(self.progress.step);
-        let mut batch_wait = BatchWait::new();
         loop {
+            self.begin_size();
             let asked = Instant::now();
             let Some(batch) = batches.next() else { break };
-            if let Some(hint) = batch_wait.add(asked.elapsed(), &self.plan.config.data) {
+            if let Some(hint) = self.batch_wait.add(asked.elapsed(), &self.plan.config.data) {
                 self.log.event(&Event::Message(hint));
             }
             // Also an error of another rank.
@@ -161,7 +164,6 @@ impl<'a> TrainLoop<'a> {
         }
         let StageSettings { steps: num_steps, optimizer, .. } = self.plan.settings;
         let step = self.progress.step + 1;
-        self.report_size(step);
         let lr = learning_rate(optimizer, step, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
         let mut anomaly = None;
@@ -191,25 +193,33 @@ impl<'a> TrainLoop<'a> {
         Ok(train_state)
     }
 
-    /// Reports the size of the images before the first step of this process and where it changes.
-    fn report_size(&mut self, step: u64) {
-        let StageSettings { stage, half_resolution_steps, .. } = self.plan.settings;
-        let last_step = self.plan.settings.last_step_of_size(step);
-        if half_resolution_steps == 0 || self.last_step_of_size == last_step {
+    /// Reports the size of the images before the first step of this process and where it changes. Where it changes, loss,
+    /// gradient norm and reading time of the former size say nothing about the following steps.
+    fn begin_size(&mut self) {
+        let step = self.progress.step + 1;
+        let settings = &self.plan.settings;
+        let StageSettings { stage, steps: last_step, half_resolution_steps, .. } = *settings;
+        let last_step_of_size = settings.last_step_of_size(step);
+        if half_resolution_steps == 0 || step > last_step || self.last_step_of_size == last_step_of_size {
             return;
         }
-        self.last_step_of_size = last_step;
-        let data = &self.plan.config.data;
-        let divisor = if step <= half_resolution_steps { 2 } else { 1 };
+        self.last_step_of_size = last_step_of_size;
+        if step == half_resolution_steps + 1 {
+            self.progress.recent = LossHistory::default();
+            self.batch_wait = BatchWait::new();
+        }
+        let Config { data, .. } = self.plan.config;
+        let divisor = if settings.is_half_resolution(step) { 2 } else { 1 };
         let size = [data.width, data.height].map(|side| side / divisor);
-        self.log.event(&Event::ImageSize { stage, size, done: step - 1, last_step });
+        self.log.event(&Event::ImageSize { stage, size, done: step - 1, last_step_of_size, last_step });
     }
 
     fn report(&mut self, update: Update, lr: f64, started: Instant) {
         self.log.event(&Event::Step(StepEvent {
             stage: self.plan.settings.stage,
             step: self.progress.step,
-            last_step: self.plan.settings.last_step_of_size(self.progress.step),
+            last_step: self.plan.settings.steps,
+            last_step_of_size: self.plan.settings.last_step_of_size(self.progress.step),
             loss: update.loss,
             psnr: psnr_of_mse(update.mse),
             lr,

@@ -3,7 +3,7 @@
 use burn::module::Module;
 use clift_model::{Clift, Part};
 
-use crate::config::config::{Config, OptimizerConfig};
+use crate::config::config::{Config, OptimizerConfig, Stage1Config};
 use crate::events::Stage;
 
 /// Settings of a stage that makes updates.
@@ -49,14 +49,26 @@ pub fn freeze(stage: Stage, mut model: Clift) -> Clift {
 }
 
 impl StageSettings<'_> {
+    /// Returns whether the images of `step`, counted from 1, have half the width and height.
+    pub fn is_half_resolution(&self, step: u64) -> bool {
+        step <= self.half_resolution_steps
+    }
+
     /// Returns the last step whose images have the size of those of `step`, counted from 1.
     pub fn last_step_of_size(&self, step: u64) -> u64 {
-        if step <= self.half_resolution_steps { self.half_resolution_steps } else { self.steps }
+        if self.is_half_resolution(step) { self.half_resolution_steps } else { self.steps }
     }
 
     /// Returns the most scenes of a micro-batch.
     pub fn micro_batch_size(&self) -> usize {
         self.batch_size.div_ceil(self.accumulate)
+    }
+}
+
+impl Stage1Config {
+    /// Returns how many of `steps` steps of stage 1 have images of half the width and height.
+    pub(crate) fn half_resolution_steps(&self, steps: u64) -> u64 {
+        (self.half_resolution * steps as f64).round() as u64
     }
 }
 
@@ -67,7 +79,7 @@ impl Config {
         let settings = StageSettings {
             stage,
             steps: stage1.steps,
-            half_resolution_steps: (stage1.half_resolution * stage1.steps as f64) as u64,
+            half_resolution_steps: stage1.half_resolution_steps(stage1.steps),
             batch_size: stage1.batch_size,
             accumulate: stage1.accumulate,
             optimizer: &stage1.optimizer,

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use clift_data::{ClipReader, ClipViews, TrainingClips, derive_seed, half_resolution, item_rng, step_rng};
-use clift_model::ModelConfig;
+use clift_data::{
+    ClipReader, ClipViews, ReadClip, TrainingClips, derive_seed, half_resolution_clips, item_rng, step_rng,
+};
 use rand::RngExt;
 use rand::seq::index::sample;
 
@@ -16,10 +17,9 @@ use crate::step::batch::{BatchTokens, StageBatch};
 /// Maker of the batches of stage 1, a pure function of (seed, step).
 pub struct Stage1Batches {
     clips: TrainingClips,
-    /// Clips of the first steps, and the number of these steps.
-    half_resolution: Option<(TrainingClips, u64)>,
-    keep_tokens: [f64; 2],
-    model: ModelConfig,
+    /// Clips of the steps with half the resolution, where there are such steps.
+    half_resolution_clips: Option<TrainingClips>,
+    config: Config,
     parts: BatchParts,
     seed: u64,
 }
@@ -29,24 +29,15 @@ impl Stage1Batches {
     pub fn new(config: &Config, reader: &ClipReader, parts: BatchParts) -> Result<Self, TrainError> {
         let Config { data, stage1, .. } = config;
         let seed = derive_seed(config.seed, "stage1");
-        let clips = |reader: &ClipReader| {
-            let read = reader.clone();
-            let read = Arc::new(move |scene, views: &_| read.read(scene, views));
+        let clips = |read: Arc<ReadClip>| {
             let clips = TrainingClips::new(reader.source.clone(), read, data.views.clone(), stage1.batch_size, seed);
             clips.map(|clips| clips.with_flip(data.flip))
         };
-        let half_resolution = match config.stage(Stage::Stage1).half_resolution_steps {
-            0 => None,
-            num_steps => Some((clips(&half_resolution(data, reader)?)?, num_steps)),
-        };
-        Ok(Self {
-            clips: clips(reader)?,
-            half_resolution,
-            keep_tokens: stage1.keep_tokens,
-            model: config.model.clone(),
-            parts,
-            seed,
-        })
+        let has_half = config.stage(Stage::Stage1).half_resolution_steps > 0;
+        let half = has_half.then(|| clips(half_resolution_clips(data, reader)?)).transpose()?;
+        let whole = reader.clone();
+        let whole = clips(Arc::new(move |scene, views| whole.read(scene, views)))?;
+        Ok(Self { clips: whole, half_resolution_clips: half, config: config.clone(), parts, seed })
     }
 
     /// Makes the batch of `step`, counted from 0.
@@ -54,10 +45,8 @@ impl Stage1Batches {
     /// The share of tokens is sampled once per step; every target view gets its own random subset.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let (mut clips, mut skipped) = (Vec::new(), Vec::new());
-        let source = match &self.half_resolution {
-            Some((half, num_steps)) if step < *num_steps => half,
-            _ => &self.clips,
-        };
+        let is_half = self.config.stage(Stage::Stage1).is_half_resolution(step + 1);
+        let source = self.half_resolution_clips.as_ref().filter(|_| is_half).unwrap_or(&self.clips);
         for slot in self.parts.slots() {
             let mut of_slot = Vec::new();
             clips.push(source.slot(step, slot, &mut of_slot)?);
@@ -65,10 +54,10 @@ impl Stage1Batches {
         }
         let num_tokens = clips.first().map(|clip| {
             let ClipViews { height, width, .. } = clip.context;
-            self.model.num_patches(clip.context.num_views(), height, width)
+            self.config.model.num_patches(clip.context.num_views(), height, width)
         });
         let num_tokens = num_tokens.transpose()?.unwrap_or_default();
-        let [low, high] = self.keep_tokens;
+        let [low, high] = self.config.stage1.keep_tokens;
         let share = low + (high - low) * step_rng(self.seed, step, "kept share").random::<f64>();
         let count = ((num_tokens as f64 * share) as usize).clamp(1, num_tokens.max(1));
         let tokens = if count == num_tokens {

@@ -6,10 +6,10 @@ use std::time::Duration;
 use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-use crate::output::event_line::{event_line, step_metrics};
+use crate::output::event_line::{event_line, step_metrics, time_left};
 use crate::output::plain::{INTERVAL_S, PlainLines};
 use crate::output::stdout::{print_note, print_warning};
-use crate::output::units::{duration, rate};
+use crate::output::units::rate;
 use crate::output::verbosity::Verbosity;
 use crate::output::visible::visible;
 
@@ -49,13 +49,12 @@ impl Sink for Bar {
             }
         }
         match (event, &self.bar) {
+            (Event::StageStarted { stage, done, num_steps }, _) => {
+                self.bar = Some(progress_bar(stage.name(), *done, *num_steps));
+            }
             // Steps with images of another size take another time.
-            (
-                Event::StageStarted { stage, done, num_steps: last }
-                | Event::ImageSize { stage, done, last_step: last, .. },
-                _,
-            ) => {
-                self.bar = Some(progress_bar(stage.name(), *done, *last));
+            (Event::ImageSize { stage, done, last_step_of_size, last_step, .. }, _) => {
+                self.bar = Some(progress_bar_to(*last_step_of_size, stage.name(), *done, *last_step));
             }
             (Event::Step(step), Some(bar)) => {
                 bar.set_message(step_metrics(step));
@@ -72,9 +71,14 @@ impl Sink for Bar {
 const TEMPLATE: &str = "{prefix} {bar:16.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
 
 pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
+    progress_bar_to(total, name, done, total)
+}
+
+/// Creates a progress bar that shows the time to `step` of `total`, up to which the pace holds.
+fn progress_bar_to(step: u64, name: &str, done: u64, total: u64) -> ProgressBar {
     // Steps of an earlier process must not count for the rate: the position is set before the clock starts.
     let hidden = ProgressDrawTarget::hidden();
-    let bar = ProgressBar::with_draw_target(Some(total), hidden).with_style(style()).with_prefix(name.to_owned());
+    let bar = ProgressBar::with_draw_target(Some(total), hidden).with_style(style(step)).with_prefix(name.to_owned());
     bar.update(|state| state.set_pos(done));
     bar.reset_eta();
     bar.set_draw_target(ProgressDrawTarget::stderr());
@@ -82,17 +86,22 @@ pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
     bar
 }
 
-fn style() -> ProgressStyle {
-    let pace = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+fn style(step: u64) -> ProgressStyle {
+    let pace = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        let (at, total) = (state.pos(), state.len().unwrap_or_default());
         // A failed write only shortens the line.
-        let _ = out.write_str(&pace(state.per_sec(), state.eta()));
+        let _ = out.write_str(&pace(state.per_sec(), at, step, total));
     };
     ProgressStyle::with_template(TEMPLATE).unwrap_or_else(|_| ProgressStyle::default_bar()).with_key("pace", pace)
 }
 
-/// Formats rate and time left; empty while the rate is unknown.
-fn pace(per_s: f64, left: Duration) -> String {
-    if per_s > 0.0 { format!("  {}, {} left", rate(per_s), duration(left.as_secs_f64())) } else { String::new() }
+/// Formats the rate and the time from `at` to `step` of `total`; empty while the rate is unknown.
+fn pace(per_s: f64, at: u64, step: u64, total: u64) -> String {
+    if per_s > 0.0 {
+        format!("  {}, {}", rate(per_s), time_left(step.saturating_sub(at) as f64 / per_s, step, total))
+    } else {
+        String::new()
+    }
 }
 
 #[cfg(test)]
@@ -109,13 +118,18 @@ mod tests {
         sink.event(&Event::StageStarted { stage: Stage::Stage1, done: 40, num_steps: 100 });
         sink.event(&step(41, 0.1));
         assert_eq!(sink.bar.as_ref().map(ProgressBar::position), Some(41));
+        let size = [32, 16];
+        sink.event(&Event::ImageSize { stage: Stage::Stage1, size, done: 41, last_step_of_size: 60, last_step: 100 });
+        let state = |bar: &ProgressBar| (bar.position(), bar.length());
+        assert_eq!(sink.bar.as_ref().map(state), Some((41, Some(100))));
         sink.event(&Event::StageFinished { stage: Stage::Stage1, elapsed_s: 1.0 });
         assert!(sink.bar.is_none());
     }
 
     #[test]
     fn no_time_left_before_the_first_step() {
-        assert_eq!(pace(0.0, Duration::ZERO), "");
-        assert_eq!(pace(0.125, Duration::from_secs(80)), "  8.0 s each, 1 min 20 s left");
+        assert_eq!(pace(0.0, 0, 60, 100), "");
+        assert_eq!(pace(0.125, 50, 60, 60), "  8.0 s each, 1 min 20 s left");
+        assert_eq!(pace(0.125, 50, 60, 100), "  8.0 s each, 1 min 20 s to step 60");
     }
 }

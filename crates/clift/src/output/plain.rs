@@ -4,8 +4,7 @@ use std::io::Write;
 
 use clift_train::{Event, Sink, StepEvent};
 
-use crate::output::event_line::{event_line, step_metrics};
-use crate::output::units::duration;
+use crate::output::event_line::{event_line, step_metrics, time_left};
 use crate::output::visible::visible;
 
 /// Seconds of training between two progress lines, unless every step is wanted.
@@ -36,13 +35,10 @@ impl<W: Write> PlainLines<W> {
         }
         self.since_line_s = 0.0;
         let mean_step_s = self.pace.1 / self.pace.0 as f64;
-        let left = duration(mean_step_s * event.last_step.saturating_sub(event.step) as f64);
-        let (name, step, last_step) = (event.stage.name(), event.step, event.last_step);
-        let width = last_step.to_string().len();
-        Some(format!(
-            "{name} {step:>width$}/{last_step}  {}  {mean_step_s:.3} s/step, {left} left",
-            step_metrics(event)
-        ))
+        let StepEvent { step, last_step, last_step_of_size, .. } = *event;
+        let left = time_left(mean_step_s * last_step_of_size.saturating_sub(step) as f64, last_step_of_size, last_step);
+        let (name, width) = (event.stage.name(), last_step.to_string().len());
+        Some(format!("{name} {step:>width$}/{last_step}  {}  {mean_step_s:.3} s/step, {left}", step_metrics(event)))
     }
 }
 
@@ -87,9 +83,15 @@ mod tests {
         let mut events = vec![Event::StageStarted { stage: Stage::Stage1, done: 0, num_steps: 100 }];
         events.extend((1..=100).map(|number| step(number, 0.25)));
         events.push(Event::StageFinished { stage: Stage::Stage1, elapsed_s: 25.0 });
+        events.insert(
+            1,
+            Event::ImageSize { stage: Stage::Stage1, size: [32, 16], done: 0, last_step_of_size: 60, last_step: 100 },
+        );
+        // The steps to come have larger images and another pace.
         let expected = "stage1: 100 steps
-stage1   1/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 25 s left
-stage1  41/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 15 s left
+stage1: images of 32 x 16 pixels to step 60
+stage1   1/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 15 s to step 60
+stage1  41/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s to step 60
 stage1  81/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s left
 stage1 100/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 0 s left
 stage1: done in 25 s
@@ -101,7 +103,6 @@ stage1: done in 25 s
     fn events_are_printed_at_once() {
         let events = [
             Event::StageStarted { stage: Stage::Stage2, done: 40, num_steps: 100 },
-            Event::ImageSize { stage: Stage::Stage1, size: [32, 16], done: 0, last_step: 60 },
             Event::Evaluated { stage: Stage::Stage2, step: 50, psnr: 24.309, ssim: None, num_views: 12 },
             Event::Checkpoint { path: "runs/tiny/stage2/step-50".into() },
             Event::Skipped { key: "room".into(), reason: "3 frames".into() },
@@ -109,7 +110,6 @@ stage1: done in 25 s
             Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: 7 },
         ];
         let expected = "stage2: resumed after 40 of 100 steps
-stage1: images of 32 x 16 pixels to step 60
 stage2 step 50: 24.31 dB over 12 validation views
 saved runs/tiny/stage2/step-50
 skipped room: 3 frames

@@ -186,8 +186,8 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
     let place = tempfile::tempdir().expect("a folder");
     let mut sizes = Vec::new();
     let mut sink = |event: &Event| {
-        if let Event::ImageSize { size, done, last_step, .. } = event {
-            sizes.push((*size, *done, *last_step));
+        if let Event::ImageSize { size, done, last_step_of_size, .. } = event {
+            sizes.push((*size, *done, *last_step_of_size));
         }
     };
     let run = Run::open(micro(place.path(), &LONG), &RunOptions::default(), &mut sink).expect("valid");
@@ -200,10 +200,13 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
     for (step, divisor) in [(0, 2), (12, 2), (13, 1), (23, 1)] {
         let (found, whole) = (batches.batch(step).expect("readable"), whole.batch(step).expect("readable"));
         for (clip, whole) in found.clips.iter().zip(&whole.clips) {
+            assert_eq!(clip.key, whole.key);
             for (views, whole) in [(&clip.context, &whole.context), (&clip.target, &whole.target)] {
                 assert_eq!((views.width, views.height), (16 / divisor, 16 / divisor), "step {step}");
                 assert_eq!((&views.frame_index, &views.c2w), (&whole.frame_index, &whole.c2w));
-                assert_eq!(views.intrinsics[0].fx * divisor as f64, whole.intrinsics[0].fx);
+                let [k, whole] = [views, whole].map(|views| views.intrinsics[0]);
+                let k = [k.fx, k.fy, k.cx, k.cy].map(|pixels| pixels * divisor as f64);
+                assert_eq!(k, [whole.fx, whole.fy, whole.cx, whole.cy]);
             }
         }
         // Ids of tokens that exist: one patch of 8 pixels for each of two views, or four.
@@ -214,6 +217,16 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
     }
     run.train(Some(Stage::Stage1), &AtomicBool::new(false), &mut sink).expect("trains");
     assert_eq!(sizes, [([8, 8], 0, 13), ([16, 16], 13, 24)]);
+    drop(run);
+
+    // The first 13 steps had small images, so no later step may have them.
+    let extend = |steps: &str| {
+        let config = micro(place.path(), &[&LONG[..], &[steps]].concat());
+        Run::open(config, &RunOptions { extend: true, ..RunOptions::default() }, &mut |_: &Event| {}).map(drop)
+    };
+    let message = extend("stage1.steps=45").unwrap_err().to_string();
+    assert!(message.contains("half the width and height again") && message.contains("write at most 44"), "{message}");
+    extend("stage1.steps=44").expect("24 of 44 steps have small images, and 24 are made");
 
     let narrow = micro(&place.path().join("narrow"), &[&LONG[..], &["data.width=8"]].concat());
     let message = Run::open(narrow, &RunOptions::default(), &mut |_: &Event| {}).map(drop).unwrap_err().to_string();

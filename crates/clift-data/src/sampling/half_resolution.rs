@@ -1,0 +1,70 @@
+//! Clips with half the columns and rows.
+
+use crate::geometry::camera::Intrinsics;
+use crate::sampling::clip::{Clip, ClipViews};
+
+impl Clip {
+    /// Returns the clip with half as many columns and rows: a pixel is the mean of two by two. Of an odd number of columns or
+    /// rows, the last one is lost.
+    #[must_use]
+    pub fn at_half_resolution(&self) -> Self {
+        let Self { key, context, target } = self;
+        Self { key: key.clone(), context: context.at_half_resolution(), target: target.at_half_resolution() }
+    }
+}
+
+impl ClipViews {
+    fn at_half_resolution(&self) -> Self {
+        let (width, height) = (self.width / 2, self.height / 2);
+        let row_bytes = 3 * self.width;
+        let mut images = Vec::with_capacity(3 * width * height * self.num_views());
+        for image in self.images.chunks_exact((row_bytes * self.height).max(1)) {
+            for rows in image.chunks_exact(2 * row_bytes) {
+                let (upper, lower) = rows.split_at(row_bytes);
+                for at in (0..width).flat_map(|column| (0..3).map(move |channel| 6 * column + channel)) {
+                    let sum: u16 = [upper[at], upper[at + 3], lower[at], lower[at + 3]].map(u16::from).iter().sum();
+                    images.push(((sum + 2) / 4) as u8);
+                }
+            }
+        }
+        let halved = |k: &Intrinsics| Intrinsics { fx: k.fx / 2.0, fy: k.fy / 2.0, cx: k.cx / 2.0, cy: k.cy / 2.0 };
+        let (c2w, frame_index) = (self.c2w.clone(), self.frame_index.clone());
+        Self { width, height, images, c2w, intrinsics: self.intrinsics.iter().map(halved).collect(), frame_index }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::pose::Pose;
+
+    #[test]
+    fn a_pixel_is_the_mean_of_two_by_two() {
+        // Two views of 5 x 3 pixels: the last column and row are lost.
+        let (width, height) = (5, 3);
+        let value = |view: usize, row: usize, column: usize, channel: usize| {
+            (100 * view + 20 * row + 4 * column + channel) as u8
+        };
+        let mut images = Vec::new();
+        for (view, row) in (0..2).flat_map(|view| (0..height).map(move |row| (view, row))) {
+            images.extend((0..width).flat_map(|column| (0..3).map(move |channel| value(view, row, column, channel))));
+        }
+        let k = Intrinsics { fx: 5.0, fy: 6.0, cx: 2.5, cy: 1.0 };
+        let views = ClipViews {
+            width,
+            height,
+            images,
+            c2w: vec![Pose::IDENTITY; 2],
+            intrinsics: vec![k; 2],
+            frame_index: vec![4, 2],
+        };
+        let clip = Clip { key: "room".into(), context: views.clone(), target: views };
+        let Clip { key, context, target } = clip.at_half_resolution();
+        assert_eq!((key.as_str(), context.width, context.height), ("room", 2, 1));
+        // The mean of 0, 4, 20 and 24 is 12.
+        assert_eq!(context.images, [12, 13, 14, 20, 21, 22, 112, 113, 114, 120, 121, 122]);
+        assert_eq!(context.intrinsics, [Intrinsics { fx: 2.5, fy: 3.0, cx: 1.25, cy: 0.5 }; 2]);
+        assert_eq!((&context.frame_index[..], &context.c2w[..]), (&[4, 2][..], &[Pose::IDENTITY; 2][..]));
+        assert_eq!(target, context);
+    }
+}
