@@ -13,7 +13,11 @@ const CRATES: [Crate; 8] = [
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights codec scene"),
+    (
+        "clift-model",
+        "clift-kernels",
+        "error names atomic_files device ops views tokens network cost weights codec scene",
+    ),
     (
         "clift-data",
         "",
@@ -28,7 +32,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-train",
         "clift-kernels clift-model clift-data clift-eval",
-        "error distributed events config step cluster_cache interchange stage checkpoint footprint token_codec run",
+        "error distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
     ),
     (
         "clift-bench",
@@ -39,7 +43,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift",
         "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
-        "output interrupt exit_code threads commands cli reference",
+        "output interrupt exit_code threads commands cli reference_pages",
     ),
 ];
 

@@ -18,7 +18,7 @@ use crate::synthetic::config::SyntheticConfig;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
-    /// Kind of the data set.
+    /// Layout of the data: `synthetic`, `auto` (detected), `chunks`, `scenes`, `re10k_txt`, `dl3dv` or `captures`.
     pub source: SourceKind,
     /// Folder with `train/` and `test/`, folder of scenes, or folder of one scene; for data sets on disk.
     pub root: Option<PathBuf>,
@@ -28,9 +28,9 @@ pub struct DataConfig {
     pub width: usize,
     /// Rows of every view, a multiple of the patch size.
     pub height: usize,
-    /// Mean orientation of the context views.
+    /// Mean orientation of the context views: of their `quaternion`s, or of their viewing `axes`.
     pub pose_rotation: PoseRotation,
-    /// Cameras that define the scale of a scene: contexts only, or contexts and targets (as in the authors'
+    /// Cameras that define the scale of a scene: the `context` views, or `all`, contexts and targets (as in the authors'
     /// released code).
     pub pose_scale: PoseScale,
     /// Older form of `crop = "exact"`.

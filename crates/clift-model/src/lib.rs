@@ -34,11 +34,11 @@
     )
 )]
 
+mod atomic_files;
 mod codec;
 mod cost;
 mod device;
 mod error;
-mod files;
 mod names;
 mod network;
 mod ops;

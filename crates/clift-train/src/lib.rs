@@ -25,6 +25,7 @@ mod config;
 mod distributed;
 mod error;
 mod events;
+mod fit_token_codec;
 mod footprint;
 mod interchange;
 mod run;
@@ -32,7 +33,6 @@ mod stage;
 mod step;
 #[cfg(test)]
 mod testing;
-mod token_codec;
 
 // Configuration
 pub use config::config::{
@@ -50,13 +50,13 @@ pub use distributed::ranks::Ranks;
 // A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
+pub use fit_token_codec::fit_token_codec;
 pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::Run;
 pub use run::run_file::RunOptions;
 pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
-pub use token_codec::fit_token_codec;
 // One update
 pub use step::batch::{BatchTokens, StageBatch};
 pub use step::device_batch::{DeviceBatch, render_loss};

@@ -14,7 +14,7 @@ mod exit_code;
 mod interrupt;
 mod output;
 #[cfg(test)]
-mod reference;
+mod reference_pages;
 mod threads;
 
 use std::process::ExitCode;

@@ -195,7 +195,7 @@ fn paths_render_to_frames_and_animation_by_count() {
         }
         let report = place.json(&format!("{out}/render.json"));
         let precision =
-            if flags.contains("f32") { Precision::F32 } else { Precision::for_pictures(&burn::tensor::Device::flex()) };
+            if flags.contains("f32") { Precision::F32 } else { Precision::for_images(&burn::tensor::Device::flex()) };
         assert_eq!(report["precision"], precision.as_str());
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
         let tokens = &report["tokens"];

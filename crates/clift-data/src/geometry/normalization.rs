@@ -10,13 +10,13 @@ use crate::geometry::pose::{Pose, unit_quaternion};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PoseRotation {
-    /// Mean of unit quaternions: the reference's choice for RealEstate10K.
+    /// Mean of unit quaternions: the choice of the released code for RealEstate10K.
     ///
-    // Departs from the reference, which aligns quaternions to w >= 0: those near half a turn from the world's axes
+    // Departs from the released code, which aligns quaternions to w >= 0: those near half a turn from the world's axes
     // cancel. Alignment to the first camera's quaternion is equal elsewhere.
     #[default]
     Quaternion,
-    /// Mean viewing direction, and the perpendicular part of the mean down direction: the reference's choice for DL3DV.
+    /// Mean viewing direction, and the perpendicular part of the mean down direction: the choice of the released code for DL3DV.
     Axes,
 }
 
@@ -27,7 +27,7 @@ pub enum PoseScale {
     /// Context cameras only, so that tokens do not depend on the targets.
     #[default]
     Context,
-    /// Context and target cameras: the reference's choice for RealEstate10K.
+    /// Context and target cameras: the choice of the released code for RealEstate10K.
     All,
 }
 

@@ -8,7 +8,7 @@ use strum::Display;
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum SourceKind {
-    /// Ray-traced rooms.
+    /// Ray-traced scenes from a seed.
     Synthetic,
     /// The detected layout, one of the layouts below.
     #[default]

@@ -1,4 +1,4 @@
-//! Ray-traced rooms from a seed. `source` joins the parts to a data source.
+//! Ray-traced scenes from a seed: rooms, and scenes like photos (`real`). `source` joins the parts to a data source.
 //!
 //! - `config`: options of synthetic scenes
 //! - `room`: a room, its objects and lamp

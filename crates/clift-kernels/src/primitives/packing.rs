@@ -80,13 +80,21 @@ pub(crate) fn pack_transposed<'a, S: Simd, O: Operands>(
         if columns < width {
             to.fill(0.0);
         }
-        for column in 0..columns {
-            let row = rows.next().expect("the iterator reports its length");
-            for (start, to) in (0..lanes).step_by(S::LANES).zip(to.chunks_mut(S::LANES * width)) {
-                let mut packed = [0.0; MAX_LANES];
-                simd.write(&mut packed, O::along(simd, row, start));
-                for (to, value) in to[column..].iter_mut().step_by(width).zip(packed) {
-                    *to = value;
+        for first in (0..columns).step_by(S::LANES) {
+            // Rows far apart in memory: several are read before the first is needed.
+            let count = S::LANES.min(columns - first);
+            let block: [&[f32]; MAX_LANES] =
+                std::array::from_fn(|row| if row < count { rows.next().unwrap_or_default() } else { &[] });
+            for start in (0..lanes).step_by(S::LANES) {
+                let mut packed = [[0.0; MAX_LANES]; MAX_LANES];
+                for (row, packed) in block.iter().zip(&mut packed).take(count) {
+                    simd.write(packed, O::along(simd, row, start));
+                }
+                for lane in 0..S::LANES.min(lanes - start) {
+                    let to = &mut to[(start + lane) * width + first..][..count];
+                    for (to, packed) in to.iter_mut().zip(&packed) {
+                        *to = packed[lane];
+                    }
                 }
             }
         }

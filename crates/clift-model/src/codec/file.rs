@@ -7,13 +7,13 @@ use safetensors::tensor::{Dtype, TensorView};
 use safetensors::{SafeTensors, serialize};
 use sha2::{Digest, Sha256};
 
+use crate::atomic_files::replace;
 use crate::codec::histogram::Distributions;
 use crate::codec::prediction::{NUM_CLASSES, Prediction};
 use crate::codec::rates::RateTable;
 use crate::codec::token_codec::TokenCodec;
 use crate::codec::transform::Transform;
 use crate::error::ModelError;
-use crate::files::replace;
 use crate::names::parse;
 use crate::network::config::ModelConfig;
 use crate::tokens::kind::TokenKind;

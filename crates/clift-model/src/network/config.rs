@@ -11,10 +11,10 @@ use crate::views::patch_grids::PatchGrids;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "ModelSection")]
 pub struct ModelConfig {
-    /// Kind of the network.
+    /// Kind of the network: `clift` or `lvsm-ed`.
     #[serde(skip_serializing_if = "is_default")]
     pub architecture: Architecture,
-    /// Variant of the network.
+    /// Variant of the network, which sets the default sizes: `paper`, `released-re10k` or `released-dl3dv`.
     pub variant: CliftVariant,
     /// Latents of LVSM, the tokens of a scene; 0 in `CLiFT`, which has a token per patch.
     #[serde(skip_serializing_if = "is_default")]
@@ -31,7 +31,8 @@ pub struct ModelConfig {
     pub num_renderer_blocks: usize,
     /// Side of a patch in pixels; every patch is one token.
     pub patch_size: usize,
-    /// How attention knows the cameras.
+    /// How attention knows the cameras: `plucker` (by the rays of the input alone), `gta` (by poses too) or `prope` (by poses and
+    /// intrinsics too).
     #[serde(skip_serializing_if = "is_default")]
     pub camera_encoding: CameraEncoding,
     /// Number of renderings, with patches shifted along the diagonal, whose mean is an image: 1, 2 or 4. Training renders an

@@ -79,7 +79,7 @@ impl Precision {
 
     /// Returns the precision in which pictures are rendered where none is named: bf16 if the device computes in it, f32
     /// elsewhere.
-    pub fn for_pictures(device: &Device) -> Self {
+    pub fn for_images(device: &Device) -> Self {
         if missing_bf16(&device.clone().without_autodiff()).is_none() { Self::Bf16 } else { Self::F32 }
     }
 

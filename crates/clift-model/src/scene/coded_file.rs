@@ -20,10 +20,10 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use crate::atomic_files::replace;
 use crate::codec::prediction::Places;
 use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
-use crate::files::replace;
 use crate::network::config::ModelConfig;
 use crate::scene::coded_views::{read_views, read_world, write_views, write_world};
 use crate::scene::header::{COPY_AGAIN, Fields, GIVE_MODEL, Refusal, refusal, write_fields};

@@ -2,7 +2,7 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use crate::files::folder_of;
+use crate::atomic_files::folder_of;
 use crate::scene::scene::Scene;
 
 impl Scene {

@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
+use crate::atomic_files::{folder_of, replace};
 use crate::error::ModelError;
-use crate::files::{folder_of, replace};
 use crate::scene::header::write_fields;
 use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;

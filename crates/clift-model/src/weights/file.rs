@@ -13,8 +13,8 @@ use burn::store::{
 };
 use burn::tensor::{DType, TensorData};
 
+use crate::atomic_files::{TEMPORARY, folder_of, publish};
 use crate::error::ModelError;
-use crate::files::{TEMPORARY, folder_of, publish};
 use crate::weights::hash::visit;
 
 /// The parameters that were read from a file into a module, and those that were not.

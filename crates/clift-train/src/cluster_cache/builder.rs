@@ -108,7 +108,7 @@ impl ClusterBuilder<'_> {
         let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
         let count = grid[uniform_below(&mut rng, grid.len())].of(num_tokens)?;
         let patches = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
-        // Tokens before the token norm, as in the reference: stage 2 trains this norm.
+        // Tokens before the token norm, as in the released code: stage 2 trains this norm.
         let context_views = upload_views(&[&clip.context], device)?;
         let tokens = || encoder.forward(&context_views).values;
         let kmeans = (kmeans, derive_seed(seed, &clip.key));

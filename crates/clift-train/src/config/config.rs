@@ -170,7 +170,7 @@ pub struct OptimizerConfig {
     pub warm_up_steps: u64,
     /// Decay rates of AdamW's first and second moment.
     pub betas: [f64; 2],
-    /// Decoupled weight decay, on every parameter as in the reference.
+    /// Decoupled weight decay, on every parameter as in the released code.
     pub weight_decay: f64,
     /// Gradients are scaled down to this global norm.
     pub max_grad_norm: f64,
@@ -240,7 +240,7 @@ pub struct ClustersConfig {
     /// Groups of tokens that stage 2 condenses: clusters of latent K-means (`kmeans`), or tiles of the views (`tile`), the
     /// baseline of the paper.
     pub grouping: Grouping,
-    /// Token counts that stage 2 trains on. Differs from the reference, which samples any ratio per scene and pads: batches
+    /// Token counts that stage 2 trains on. Differs from the released code, which samples any ratio per scene and pads: batches
     /// from a grid need no padding.
     pub grid: Vec<TokenCount>,
     /// Number of context sets per scene.

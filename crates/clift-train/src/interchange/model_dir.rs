@@ -15,7 +15,7 @@ use crate::interchange::record::{ImportRecord, check_stop};
 /// Name, shape and row-major values of a tensor in PyTorch's layout, as [`clift_data::write_state_dict`] takes it.
 pub type HostTensor = (String, Vec<usize>, Vec<f32>);
 
-/// Returns the settings with which the reference evaluates a published network.
+/// Returns the settings with which the released code evaluates a published network.
 pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
     // Run directory of `clift train` with this config.
     let run_dir = Path::new("runs").join(folder.file_name().unwrap_or("imported".as_ref()));

@@ -24,6 +24,7 @@ use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
+use crate::fit_token_codec::ensure_codec;
 use crate::footprint::largest_tensor;
 use crate::run::eval_folder::{EvalFolder, SUMMARY, read_summary};
 use crate::run::evaluate_model::{open_lvsm, open_stage2};
@@ -36,7 +37,6 @@ use crate::run::validation::{EvalRequest, Validation};
 use crate::stage::settings::StageSettings;
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
-use crate::token_codec::ensure_codec;
 
 /// An open run.
 pub struct Run {

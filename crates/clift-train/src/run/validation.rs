@@ -78,7 +78,7 @@ impl<'a> Validation<'a> {
         let shared: Vec<&str> = self.evaluator.keys().filter(|key| keys.contains(key)).collect();
         let first = shared.first()?;
         Some(format!(
-            "{} of the evaluation have the keys of training scenes, such as {first}: the results are not of held-out scenes",
+            "the evaluation shares {} with training, such as {first}: the results are not of held-out scenes",
             plural(shared.len(), "scene"),
         ))
     }

@@ -8,7 +8,7 @@ use burn::tensor::Tensor;
 use crate::config::config::{Algorithm, OptimizerConfig};
 use crate::step::muon::Muon;
 
-/// The optimizer of a stage: AdamW with the reference's epsilon of 1e-8, and, if the config names Muon, Muon for the weight
+/// The optimizer of a stage: AdamW with the released code's epsilon of 1e-8, and, if the config names Muon, Muon for the weight
 /// matrices of the transformer blocks. Weight decay applies to every parameter.
 ///
 /// Muon's updates are scaled to the size of AdamW's (`0.2 sqrt(max(rows, columns))`, arXiv 2502.16982), so that both

@@ -90,7 +90,7 @@ impl ViewServer {
                 .filter(|one| one.check("precision", &device).is_ok())
                 .map(Precision::as_str)
                 .collect(),
-            default_precision: Precision::for_pictures(&device).as_str(),
+            default_precision: Precision::for_images(&device).as_str(),
             version: env!("CARGO_PKG_VERSION"),
         };
         let clients = Arc::new(Clients::default());

@@ -46,8 +46,8 @@ pub struct EncodeArgs {
     /// Context frames by position or file name [default: spread along the path]
     ///
     /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
-    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. By default, as many as in training; of a capture, every fourth
-    /// frame, up to three times as many, if the network has camera-relative attention.
+    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. By default, as many as in training; of a DIR of the command line,
+    /// every fourth frame, up to three times as many, if the network has camera-relative attention.
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
     pub context: Vec<String>,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]

@@ -67,7 +67,7 @@ Examples:
     /// unless `data.files.test_scenes` divides it. Image files are copied byte by byte, unless their lens distortion is
     /// removed or --max-size reduces them.
     /// An interrupted conversion resumes: SHA256SUMS lists the complete files, and `sha256sum -c SHA256SUMS` verifies
-    /// them at any time. Exits with 1 if no scene of a split can be converted.
+    /// them at any time. Exits with 1 if an image is unreadable or no scene of a split can be converted.
     #[command(after_help = "\
 Examples:
   clift data convert captures/fox fox-chunks --to chunks --max-size 512 --quality 95

@@ -75,7 +75,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let stop = interrupt::flag()?;
     let opened = device.open()?;
-    let precision = args.precision.unwrap_or_else(|| Precision::for_pictures(&opened));
+    let precision = args.precision.unwrap_or_else(|| Precision::for_images(&opened));
     precision.check("--precision", &opened)?;
     let _precision = precision.scope();
     let network = load_renderer(&scene, &weights, &opened)?;
