@@ -79,7 +79,7 @@ class Bench:
         rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         times = [row["step_s"] for row in rows if "step_s" in row]
         stage1 = tomllib.loads((run / "config.toml").read_text())["stage1"]
-        num_half = round(stage1.get("half_resolution", 0) * TIMED_STEPS)
+        num_half = int(stage1.get("half_resolution", 0) * TIMED_STEPS + 1e-6)
         parts = [part for part in (times[:num_half], times[num_half:]) if part]
         return sum(len(part) * statistics.median(part[5:]) for part in parts) / TIMED_STEPS
 

@@ -53,7 +53,8 @@ impl StepExtension {
         if stage == Stage::Stage1 {
             let [half_from, half_to] = [from, to].map(|steps| config.stage1.half_resolution_steps(steps));
             if half_from < at_step && at_step < half_to {
-                let most = ((at_step as f64 + 0.5) / config.stage1.half_resolution).ceil() as u64 - 1;
+                let most = (at_step as f64 + 1.0 - 1e-6) / config.stage1.half_resolution;
+                let most = most.ceil() as u64 - 1;
                 let fix = format!(
                     "images would have half the width and height again (stage1.half_resolution): write at most {most}, or \
                      start a new run with stage1.init_from"

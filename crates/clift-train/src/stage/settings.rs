@@ -66,9 +66,10 @@ impl StageSettings<'_> {
 }
 
 impl Stage1Config {
-    /// Returns how many of `steps` steps of stage 1 have images of half the width and height.
+    /// Returns how many of `steps` steps of stage 1 have images of half the width and height: the share, rounded down.
     pub(crate) fn half_resolution_steps(&self, steps: u64) -> u64 {
-        (self.half_resolution * steps as f64).round() as u64
+        // 0.29 * 100 is below 29 by rounding.
+        (self.half_resolution * steps as f64 + 1e-6) as u64
     }
 }
 

@@ -224,9 +224,9 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
         let config = micro(place.path(), &[&LONG[..], &[steps]].concat());
         Run::open(config, &RunOptions { extend: true, ..RunOptions::default() }, &mut |_: &Event| {}).map(drop)
     };
-    let message = extend("stage1.steps=45").unwrap_err().to_string();
-    assert!(message.contains("half the width and height again") && message.contains("write at most 44"), "{message}");
-    extend("stage1.steps=44").expect("24 of 44 steps have small images, and 24 are made");
+    let message = extend("stage1.steps=46").unwrap_err().to_string();
+    assert!(message.contains("half the width and height again") && message.contains("write at most 45"), "{message}");
+    extend("stage1.steps=45").expect("24 of 45 steps have small images, and 24 are made");
 
     let narrow = micro(&place.path().join("narrow"), &[&LONG[..], &["data.width=8"]].concat());
     let message = Run::open(narrow, &RunOptions::default(), &mut |_: &Event| {}).map(drop).unwrap_err().to_string();
