@@ -107,13 +107,16 @@ pub fn plan(config: &Config, options: &PlanOptions) -> Result<Plan, TrainError> 
     };
     let per_view_s = if is_timed { loading_s(config) } else { None };
     // Photos are read at the whole size and then reduced; small images of synthetic scenes are drawn faster.
-    let is_synthetic = config.data.source == SourceKind::Synthetic;
-    let drawn = if is_timed && is_synthetic { sizes(config, Stage::Stage1) } else { Vec::new() };
-    let of_stage1 = drawn.iter().map(|(share, config)| Some(share * loading_s(config)?)).sum::<Option<f64>>();
+    let of_stage1 = match &sizes(config, Stage::Stage1)[..] {
+        sizes @ [_, _] if is_timed && config.data.source == SourceKind::Synthetic => {
+            sizes.iter().map(|(share, config)| Some(share * loading_s(config)?)).sum()
+        }
+        _ => per_view_s,
+    };
     for part in &mut plan.parts {
         let (num_views, num_threads) = views_and_threads(config, part.part, num_ranks);
-        let is_drawn = part.part == Stage::Stage1.name() && !drawn.is_empty();
-        part.loading_s = if is_drawn { of_stage1 } else { per_view_s }.map(|seconds| seconds * num_views);
+        let is_stage1 = part.part == Stage::Stage1.name();
+        part.loading_s = if is_stage1 { of_stage1 } else { per_view_s }.map(|seconds| seconds * num_views);
         part.seconds = part.compute_s.map(|compute| {
             let busy = part.busy_threads.filter(|_| config.device.is_cpu());
             let shared = busy.map(|busy| SharedCores { cores: plan.threads as f64, busy });
