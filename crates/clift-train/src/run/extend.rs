@@ -2,7 +2,8 @@
 //!
 //! The steps made so far are kept. The following steps use the learning rates and image sizes of a run with the new number of
 //! steps: the rate jumps to the cosine of that run and decays to zero at the new end. The result therefore differs from a run that
-//! had the new number from the start, and `run.json` records the extension.
+//! had the new number from the start, and `run.json` records the extension. Steps with images of half the size after steps with
+//! whole ones are refused.
 
 use clift_model::TokenCodec;
 use serde::{Deserialize, Serialize};
@@ -53,8 +54,7 @@ impl StepExtension {
         if stage == Stage::Stage1 {
             let [half_from, half_to] = [from, to].map(|steps| config.stage1.half_resolution_steps(steps));
             if half_from < at_step && at_step < half_to {
-                let most = (at_step as f64 + 1.0 - 1e-6) / config.stage1.half_resolution;
-                let most = most.ceil() as u64 - 1;
+                let most = config.stage1.most_steps(at_step);
                 let fix = format!(
                     "images would have half the width and height again (stage1.half_resolution): write at most {most}, or \
                      start a new run with stage1.init_from"

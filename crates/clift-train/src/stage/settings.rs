@@ -65,11 +65,18 @@ impl StageSettings<'_> {
     }
 }
 
+/// Makes up for the rounding of a share of steps: 0.29 * 100 is below 29.
+const ROUNDING: f64 = 1e-6;
+
 impl Stage1Config {
     /// Returns how many of `steps` steps of stage 1 have images of half the width and height: the share, rounded down.
     pub(crate) fn half_resolution_steps(&self, steps: u64) -> u64 {
-        // 0.29 * 100 is below 29 by rounding.
-        (self.half_resolution * steps as f64 + 1e-6) as u64
+        (self.half_resolution * steps as f64 + ROUNDING) as u64
+    }
+
+    /// Returns the largest number of steps of which at most `count` have images of half the width and height.
+    pub(crate) fn most_steps(&self, count: u64) -> u64 {
+        ((count as f64 + 1.0 - ROUNDING) / self.half_resolution).ceil() as u64 - 1
     }
 }
 
