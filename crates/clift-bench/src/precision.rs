@@ -5,8 +5,9 @@ use std::time::Instant;
 
 use burn::tensor::Tensor;
 use clift_data::median;
+use clift_eval::psnr_of_mse;
 use clift_model::{DeviceName, Precision};
-use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze, psnr_of_mse};
+use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze};
 use serde::Serialize;
 
 use crate::cases::case::BenchCase;

@@ -62,6 +62,16 @@ impl EncodedScene {
     }
 }
 
+/// Chooses `num_views` context frames of a scene, or all its frames if it has fewer, at equal distances along the camera
+/// path, as [`encode`] does without [`EncodeOptions::context`].
+///
+/// # Errors
+/// Those of the cameras, and [`DataError::ZeroBaseline`](clift_data::DataError::ZeroBaseline) for frames without a scale.
+pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, EvalError> {
+    let (context, _) = contexts(reader, scene, None, num_views)?;
+    Ok(context)
+}
+
 /// Encodes a scene of `reader`. The groups equal those of `clift eval` for the same contexts and count.
 ///
 /// # Errors
@@ -73,14 +83,10 @@ pub fn encode(
     scene: usize,
     options: &EncodeOptions,
 ) -> Result<EncodedScene, EvalError> {
-    let key = reader.source.key(scene);
-    let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
-    let frames = context_frames(&poses, options.context.as_deref(), options.num_context)?;
-    let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-    let views = ViewIndices { context: frames, target: Vec::new() };
+    let (key, data) = (reader.source.key(scene), &reader.options);
+    let (context, frame) = contexts(reader, scene, options.context.as_deref(), options.num_context)?;
+    let views = ViewIndices { context, target: Vec::new() };
     let clip = reader.read(scene, &views)?;
-    let data = &reader.options;
-    let frame = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
 
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
@@ -124,6 +130,21 @@ pub fn encode(
         tokens,
     };
     Ok(EncodedScene { scene, num_lift_tokens, cluster_error, clusters })
+}
+
+/// Returns the context frames of a scene and the frame of its poses.
+fn contexts(
+    reader: &ClipReader,
+    scene: usize,
+    requested: Option<&[usize]>,
+    num_views: usize,
+) -> Result<(Vec<usize>, PoseNormalization), EvalError> {
+    let (key, data) = (reader.source.key(scene), &reader.options);
+    let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
+    let frames = context_frames(&poses, requested, num_views)?;
+    let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
+    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
+    Ok((frames, normalization))
 }
 
 /// Checks the requested context frames, or chooses `num_views` frames along the camera path.

@@ -39,11 +39,11 @@ mod upload;
 pub use error::EvalError;
 
 // Encode images; clips as tensors.
-pub use encode::{EncodeOptions, EncodedScene, encode};
+pub use encode::{EncodeOptions, EncodedScene, encode, spread_contexts};
 pub use upload::{upload_cameras, upload_images, upload_views, view_cameras};
 
 // Metrics and the perceptual loss.
-pub use metrics::image_metrics::{psnr, ssim};
+pub use metrics::image_metrics::{psnr, psnr_of_mse, ssim};
 pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
 pub use metrics::vgg::VggShape;

@@ -124,7 +124,8 @@ Examples:
     #[command(after_help = "\
 Paths:
   interpolate   through the context views
-  orbit         once around the point that the context views look at
+  orbit         a small ellipse about the mean context view, facing the point
+                that the context views look at
   FILE.json     {\"poses\": [{\"c2w\": [[4 numbers] x 3]}, ..]}: camera to world,
                 OpenCV axes, in the world of the capture; a pose may have
                 \"intrinsics_norm\": [fx, fy, cx, cy], over width and height;

@@ -2,7 +2,8 @@
 
 use std::process::Command;
 
-use crate::support::{BINARY, Place, finish, repository, start};
+use crate::support::{BINARY, Place, copy_folder, finish, list, repository, start};
+use crate::viewer::tab::{Tab, Viewer};
 
 /// Keys that put the micro run on six frames of 32 x 18.
 fn data(source: &str, layout: &str, more: &str) -> String {
@@ -25,6 +26,15 @@ fn captures_train_and_render_and_name_missing_frames() {
     place.clift(encode).ok().prints("scene attic, 2 views of 16 x 16");
     let render = "render DIR/attic.clift --path interpolate --frames 2 -o DIR/frames";
     place.clift(render).ok().prints("2 frames of 16 x 16");
+
+    // The viewer takes the contexts of `clift encode`, also of captures too short for an evaluation.
+    copy_folder(&repository("data-fixtures/layouts/capture/attic"), &place.at("few"));
+    let mut transforms = place.json("few/transforms.json");
+    transforms["frames"].as_array_mut().unwrap().truncate(2);
+    place.write("few/transforms.json", transforms.to_string());
+    let tab = Tab::open(&Viewer::start(&["run", "few"], &place.at("")));
+    let frames: Vec<_> = list(&tab.scene["context"]).iter().map(|view| view["frame"].as_u64()).collect();
+    assert_eq!(frames, [Some(0), Some(1)]);
 
     let with_model = |model: &str| {
         let mut command = Command::new(BINARY);

@@ -113,3 +113,24 @@ fn codecs_are_exported_and_imported() {
     let expected = ["the scene was coded with the codec ", "give the run it was encoded with"];
     place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/again").fails_with(1, &expected);
 }
+
+#[test]
+fn coded_scenes_have_the_patch_grids_of_the_model_now() {
+    let place = Place::new();
+    place.copy(&WHOLE, "run");
+    let config = place.at("run/config.toml");
+    let text = std::fs::read_to_string(&config).unwrap();
+    let set = |grids: &str| {
+        assert_eq!(text.matches("\npatch_grids = 1\n").count(), 1, "{text}");
+        std::fs::write(&config, text.replace("\npatch_grids = 1\n", &format!("\npatch_grids = {grids}\n"))).unwrap();
+    };
+    let grids = |file: &str| {
+        place.clift(&format!("render DIR/{file} --path orbit --frames 2 --force -o DIR/out")).ok();
+        place.json("out/render.json")["patch_grids"].clone()
+    };
+    set("2");
+    encode(&place, "").ok().prints("(clift, coded");
+    assert_eq!(grids("room.clift"), 2, "the codec was fitted with 1");
+    set("4");
+    assert_eq!(grids("room.clift"), 4);
+}

@@ -78,7 +78,7 @@ pub fn read_poses(
     let wrong_form = |error: serde_json::Error| {
         bad(format!("expected a transforms.json or {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))
     };
-    let form = parse_json(&text).unwrap_or(FileForm { poses: None, frames: None });
+    let form: FileForm = parse_json(&text).map_err(wrong_form)?;
     let is_transforms = form.frames.is_some() && form.poses.is_none();
     let poses: Vec<FilePose> = if is_transforms {
         let mut file: TransformsFile = parse_json(&text).map_err(wrong_form)?;

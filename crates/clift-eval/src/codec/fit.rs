@@ -15,6 +15,7 @@ use rand::RngExt;
 
 use crate::error::EvalError;
 use crate::evaluator::progress::Progress;
+use crate::metrics::image_metrics::psnr_of_mse;
 use crate::sweep::compressed_tokens::with_values;
 use crate::upload::{host_values, upload_cameras, upload_views};
 
@@ -110,6 +111,9 @@ pub fn fit_codec(
         }
     }
     let deviation = mean_variance(&transform).sqrt();
+    if deviation == 0.0 {
+        return Err(EvalError::NoScenes { reason: "all tokens of the training scenes are equal".into() });
+    }
     let steps: Vec<f64> = STEPS.iter().map(|factor| factor * deviation).collect();
 
     let kind = if model.has_condenser { TokenKind::Clift } else { TokenKind::Kmeans };
@@ -123,10 +127,16 @@ pub fn fit_codec(
     };
     let codec = TokenCodec::new(network.clone(), (transform, prediction), histograms.distributions(), unknown)?;
     let mut rates = Measured::new(options.counts.len(), steps);
+    let mut num_measured = 0;
     for item in measured {
         if let Some(clip) = fit.read(item)? {
             fit.measure(&clip, &codec, &mut rates)?;
+            num_measured += 1;
         }
+    }
+    if num_measured == 0 {
+        let reason = format!("none of the first {} training scenes is readable", measured.len());
+        return Err(EvalError::NoScenes { reason });
     }
     let table = rates.table()?;
     let codec = TokenCodec::new(network, (codec.transform, codec.prediction), codec.distributions, table)?;
@@ -241,7 +251,7 @@ impl Fit<'_> {
             let values = host_values(&tokens)?;
             let (num_tokens, exact) = (tokens.dims()[1], render(tokens.clone())?);
             let errors = view_errors(&exact, &truth, view_len);
-            let psnr: Vec<f64> = errors.iter().map(|error| -10.0 * error.log10()).collect();
+            let psnr: Vec<f64> = errors.iter().map(|&error| psnr_of_mse(error)).collect();
             rates.shares[c].push(num_tokens as f64 / lift.dims()[1] as f64);
             rates.psnr[c].push(mean(&psnr).unwrap_or_default());
             for k in 0..rates.steps.len() {

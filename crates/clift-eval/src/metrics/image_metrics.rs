@@ -27,8 +27,12 @@ pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
         .zip(target)
         .map(|(p, t)| (f64::from(p.clamp(0.0, 1.0)) - f64::from(t.clamp(0.0, 1.0))).powi(2))
         .sum();
-    // Of opposite images, a difference: a product would be -0.
-    Ok(0.0 - 10.0 * (squared_error / target.len() as f64).log10())
+    Ok(psnr_of_mse(squared_error / target.len() as f64))
+}
+
+/// Returns the PSNR in dB of a mean squared error of values in `[0, 1]`.
+pub fn psnr_of_mse(mse: f64) -> f64 {
+    0.0 - 10.0 * mse.log10() // 0, not -0, of a mean squared error of 1
 }
 
 /// Measures the structural similarity of two `[height, width, 3]` images; 1 for identical images.

@@ -24,7 +24,7 @@ pub const MAX_FIGURES: usize = 6;
 
 const SCENES_NOTE: &str = "The middle target view of each scene, rendered by every method. In the maps, a patch of the \
                            context views has the colour of its cluster; rings mark the centroids, which are the \
-                           stored tokens. Error maps: the largest channel's absolute difference, brightest from 0.25 on.";
+                           stored tokens. Error maps: the mean absolute difference of the channels, brightest from 0.25 on.";
 
 const SELECTION_NOTE: &str = "For views rendered from fewer tokens than stored, dots mark the tokens selected for the \
                               target and rings mark the other stored tokens.";

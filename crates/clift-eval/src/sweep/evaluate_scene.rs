@@ -120,9 +120,7 @@ fn add_jobs<'a>(
                 let all = RenderJob::new(whole, &stored, None, kept_views);
                 renderer.warm_up(&all, metrics)?;
                 jobs.push(all);
-                let has_latents = stored.model.config.has_latents();
-                let counts = if has_latents { Vec::new() } else { render_counts(&sweep.render, num_storage_tokens) };
-                for num_render_tokens in counts {
+                for num_render_tokens in render_counts(&sweep.render, num_storage_tokens) {
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
                     metrics.selection = Some(sweep.selection);

@@ -23,8 +23,9 @@ pub struct HeldOutFrame {
 }
 
 impl HeldOutFrame {
-    /// Renders the frame farthest from the contexts, by number, between the first and the last context. `scene` was encoded
-    /// by `model` from scene `index` of `reader`. Returns `None` if every frame is a context, or no other frame is readable.
+    /// Renders the frame farthest from the contexts, by number, between the first and the last context; without one, the
+    /// nearest beside them. `scene` was encoded by `model` from scene `index` of `reader`. Returns `None` if every frame is a
+    /// context, or no other frame is readable.
     ///
     /// # Errors
     /// The errors of the model.
@@ -57,7 +58,7 @@ pub(crate) struct CheckViews {
 }
 
 impl CheckViews {
-    /// Reads up to `count` frames that are no contexts, the farthest from the contexts first; `None` if none is readable.
+    /// Reads up to `count` frames that are no contexts, the first [`candidates`]; `None` if none is readable.
     pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, EvalError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let frames = candidates(&context, reader.source.cameras(index)?.len());
@@ -110,12 +111,14 @@ pub(crate) fn render_scene(
     Ok(rendered.into_iter().map(|view| view.pixels).collect())
 }
 
-/// Returns the frames that are no contexts: those between the contexts first, the farthest from a context first.
+/// Returns the frames that are no contexts: those between the contexts, the farthest from a context first, then the others,
+/// the nearest first.
 fn candidates(context: &[usize], num_frames: usize) -> Vec<usize> {
     let mut frames: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
     let is_outside = |frame: usize| context.iter().all(|&c| c < frame) || context.iter().all(|&c| c > frame);
     let distance = |frame: usize| context.iter().map(|&c| c.abs_diff(frame)).min().unwrap_or_default();
-    frames.sort_by_key(|&frame| (is_outside(frame), std::cmp::Reverse(distance(frame))));
+    let key = |frame| if is_outside(frame) { (true, distance(frame)) } else { (false, num_frames - distance(frame)) };
+    frames.sort_by_key(|&frame| key(frame));
     frames
 }
 
@@ -125,7 +128,7 @@ mod tests {
 
     #[test]
     fn frames_between_contexts_come_first() {
-        assert_eq!(candidates(&[2, 8, 4], 12), [6, 3, 5, 7, 11, 0, 10, 1, 9]);
+        assert_eq!(candidates(&[2, 8, 4], 12), [6, 3, 5, 7, 1, 9, 0, 10, 11]);
         assert_eq!(candidates(&[0, 1], 2), [0; 0]);
     }
 }

@@ -54,8 +54,7 @@ impl Scene {
             let bytes = std::fs::read(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?;
             from_bytes(&bytes, &|model_path| {
                 let model = model.map_or_else(|| find_model(model_path, path), Path::to_owned);
-                let weights = ModelPath::find(&model).map_err(|error| error.to_string())?.weights;
-                TokenCodec::read(&TokenCodec::path_of(&weights)).map_err(|error| error.to_string())
+                codec_of(&model).map_err(|error| error.to_string())
             })
         };
         read().map_err(|Refusal { reason, fix }| ModelError::SceneFile {
@@ -65,6 +64,15 @@ impl Scene {
             path: path.into(),
         })
     }
+}
+
+/// Reads the codec of a model. The number of patch grids does not change the tokens: it is the one of the model's config
+/// now, not the one when the codec was fitted.
+fn codec_of(model: &Path) -> Result<TokenCodec, ModelError> {
+    let path = ModelPath::find(model)?;
+    let mut codec = TokenCodec::read(&TokenCodec::path_of(&path.weights))?;
+    codec.model.patch_grids = path.config()?.patch_grids;
+    Ok(codec)
 }
 
 /// Reads a scene; `find_codec` returns the codec of a model path.

@@ -2,6 +2,7 @@
 //!
 //! A log stores the finished entries; an interrupted build resumes from it.
 
+use std::io::ErrorKind;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -88,8 +89,7 @@ impl ClusterBuilder<'_> {
             Ok((context, clusters)) => {
                 Ok(Ok((context, clusters.assignment().to_vec(), clusters.centroid_index().to_vec())))
             }
-            // A failing disk is not a problem of the scene.
-            Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => Ok(Err(error.to_string())),
+            Err(TrainError::Data(error)) if is_of_scene(&error) => Ok(Err(error.to_string())),
             Err(other) => Err(other),
         }
     }
@@ -100,9 +100,8 @@ impl ClusterBuilder<'_> {
         let views = &config.data.views;
         let mut rng = item_rng(seed, pass, scene as u32, 0, "context and count");
         let num_context = views.min_context + uniform_below(&mut rng, views.max_context - views.min_context + 1);
-        // The gaps between contexts at the end of stage 1.
-        let last_step = config.stage1.steps.min(views.warm_up_steps);
-        let context = views.sample(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
+        let step = config.last_gap_step();
+        let context = views.sample(reader.source.as_ref(), scene, step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
         let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
         let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
@@ -113,5 +112,13 @@ impl ClusterBuilder<'_> {
         let tokens = || encoder.forward(&context_views).values;
         let kmeans = (kmeans, derive_seed(seed, &clip.key));
         Ok((context, grouping.group(count, (num_context, patches), kmeans, tokens)?))
+    }
+}
+
+/// Whether an error concerns one scene alone. A failing disk does not.
+fn is_of_scene(error: &DataError) -> bool {
+    match error {
+        DataError::Io { source, .. } => matches!(source.kind(), ErrorKind::NotFound | ErrorKind::PermissionDenied),
+        _ => true,
     }
 }

@@ -63,6 +63,13 @@ impl Config {
         if self.model.has_latents() { &[Stage::Stage1] } else { &[Stage::Stage1, Stage::Clusters, Stage::Stage2] }
     }
 
+    /// Returns the step of stage 1 whose gaps between contexts stage 2 has: the last one, or the last of the warm-up of the
+    /// gaps where stage 1 has no steps, because the run starts from a trained model.
+    pub fn last_gap_step(&self) -> u64 {
+        let warm_up_steps = self.data.views.warm_up_steps;
+        if self.stage1.steps == 0 { warm_up_steps } else { self.stage1.steps.min(warm_up_steps) }
+    }
+
     /// Returns the stages of a run and its evaluation.
     pub fn parts(&self) -> Vec<Stage> {
         [self.stages(), &[Stage::Eval]].concat()

@@ -43,11 +43,12 @@ pub fn evaluate_model(
     }
     if last.has_condenser && stage1.is_none() {
         // Its renderer was trained on condensed tokens: other tokens would be no fair baseline.
+        let own = Method::condensed(config.clusters.grouping);
         let methods = &mut config.eval.variants;
         if methods.is_empty() {
-            methods.push(Method::Clift);
+            methods.push(own);
         }
-        if let Some(method) = methods.iter().find(|method| **method != Method::Clift) {
+        if let Some(method) = methods.iter().find(|method| **method != own) {
             let fix = "give the stage-1 model, which renders this method, with --stage1";
             return Err(bad("eval.variants", method.name(), fix));
         }
@@ -88,10 +89,10 @@ pub(crate) fn open_lvsm(
 ) -> Result<TrainedModel, TrainError> {
     let [ours, theirs] = [evaluated, config].map(|config| config.data.clip_options());
     let refuse = |fix: &str| Err(bad("--with", config.run_dir.display(), fix));
-    if (theirs.width, theirs.height, theirs.pose_rotation, theirs.pose_scale)
-        != (ours.width, ours.height, ours.pose_rotation, ours.pose_scale)
-    {
-        return refuse("it was trained on images of another size or on other poses: choose a run with the same [data]");
+    if theirs != ours {
+        return refuse(
+            "it was trained on images of another size or crop, or on other poses: choose a run with the same [data]",
+        );
     }
     if others.iter().any(|other| other.config.num_latents == config.model.num_latents) {
         return refuse("another run of LVSM has as many latents: choose runs with distinct model.num_latents");

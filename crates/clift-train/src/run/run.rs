@@ -148,7 +148,7 @@ impl Run {
             std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
         }
         self.report_opening(Split::Train, sink);
-        let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
+        let opened = open_training_dataset(&self.config.data, self.config.last_gap_step())?;
         let is_divided = opened.kind != SourceKind::Synthetic && !opened.shares_scenes && self.overfit.is_none();
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use burn::module::Module;
 use clift_data::{make_folder, plural};
+use clift_eval::psnr_of_mse;
 use clift_model::{Clift, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
@@ -21,7 +22,7 @@ use crate::run::stage_plan::StagePlan;
 use crate::run::validation::Validation;
 use crate::stage::settings::{StageSettings, freeze};
 use crate::step::batch::StageBatch;
-use crate::step::loss::{Loss, psnr_of_mse};
+use crate::step::loss::Loss;
 use crate::step::loss_scale::LossScale;
 use crate::step::schedule::learning_rate;
 use crate::step::step_guard::{BatchScenes, LossHistory, SkippedStep, StepAnomaly};
@@ -144,8 +145,9 @@ impl<'a> TrainLoop<'a> {
             if is_stopped && !self.is_last() {
                 return Err(TrainError::Interrupted { step: self.progress.step });
             }
-            // After the save: a failing validation must not lose the step.
-            self.validate_if_due(&train_state)?;
+            if let Err(error) = self.validate_if_due(&train_state) {
+                return Err(self.save_before(error, &train_state));
+            }
         }
         self.log.check()?;
         Ok(train_state.model)

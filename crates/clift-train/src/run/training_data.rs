@@ -32,10 +32,12 @@ impl TrainingData {
         })
     }
 
-    /// Returns whether `config` reads the data set that the run was trained on.
+    /// Returns whether `config` may read frames that the run was trained on: from the same folder, from one inside the other,
+    /// or, where the folder of the training is gone, from any, because the data may have moved.
     pub fn is_of(&self, config: &Config) -> bool {
-        let real = |path: &PathBuf| path.canonicalize().unwrap_or_else(|_| path.clone());
-        self.root.as_ref().map(real) == config.data.root.as_ref().map(real)
+        let (Some(trained), Some(read)) = (&self.root, &config.data.root) else { return self.root == config.data.root };
+        let Ok(trained) = trained.canonicalize() else { return true };
+        read.canonicalize().is_ok_and(|read| read.starts_with(&trained) || trained.starts_with(&read))
     }
 }
 
@@ -57,5 +59,15 @@ mod tests {
         assert!(data.hold_out == 4 && !data.is_of(&config));
         config.data.root = Some(folder.path().join("."));
         assert!(data.is_of(&config), "the same folder by another path");
+        let [inner, other] = ["inner", "other"].map(|name| folder.path().join(name));
+        std::fs::create_dir(&inner).unwrap();
+        config.data.root = Some(inner.clone());
+        assert!(data.is_of(&config), "a part of it");
+        let data = read(&format!("[data]\nroot = '{}'", inner.display()));
+        config.data.root = Some(other.clone());
+        std::fs::create_dir(&other).unwrap();
+        assert!(!data.is_of(&config));
+        std::fs::remove_dir(&inner).unwrap();
+        assert!(data.is_of(&config), "it may have moved");
     }
 }

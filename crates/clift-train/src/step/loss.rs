@@ -90,8 +90,3 @@ impl Loss {
 pub fn mse(rendering: Tensor<5>, target: Tensor<5>) -> Tensor<1> {
     (rendering - target).square().mean()
 }
-
-/// Returns the PSNR in dB of a mean squared error of values in `[0, 1]`.
-pub fn psnr_of_mse(mse: f64) -> f64 {
-    0.0 - 10.0 * mse.log10() // 0, not -0, of a mean squared error of 1
-}

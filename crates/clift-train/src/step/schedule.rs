@@ -12,10 +12,10 @@ const DECAY_SHARE: f64 = 0.5;
 /// the schedule down to 0 at `num_steps` and later.
 pub fn learning_rate(optimizer: &OptimizerConfig, step: u64, num_steps: u64) -> f64 {
     let OptimizerConfig { learning_rate: base, warm_up_steps, schedule, .. } = *optimizer;
-    if step <= warm_up_steps {
-        return START + (base - START) * step as f64 / warm_up_steps as f64;
-    }
+    let is_warm_up = step <= warm_up_steps;
+    let risen = if is_warm_up { START + (base - START) * step as f64 / warm_up_steps as f64 } else { base };
     match schedule {
+        Schedule::Cosine if is_warm_up => risen,
         Schedule::Cosine => {
             let num_decay_steps = num_steps.saturating_sub(warm_up_steps).max(1) as f64;
             let progress = ((step - warm_up_steps) as f64 / num_decay_steps).min(1.0);
@@ -23,7 +23,8 @@ pub fn learning_rate(optimizer: &OptimizerConfig, step: u64, num_steps: u64) -> 
         }
         Schedule::Wsd => {
             let num_decay_steps = (DECAY_SHARE * num_steps as f64).max(1.0);
-            base * (num_steps.saturating_sub(step) as f64 / num_decay_steps).min(1.0)
+            // A warm-up of more than half of the steps ends where it meets the fall.
+            risen.min(base * (num_steps.saturating_sub(step) as f64 / num_decay_steps).min(1.0))
         }
     }
 }
@@ -66,5 +67,10 @@ mod tests {
             assert!((rate - expected).abs() < 1e-8, "{rate} is not {expected}");
         }
         assert!(rate(Schedule::Wsd, 1, 1e-3, 0, 1).abs() < 1e-20);
+        // Of a warm-up of more than half of the steps, without a jump.
+        for (step, expected) in [(60, 0.75), (70, 0.6), (80, 0.4), (81, 0.38)] {
+            let rate = rate(Schedule::Wsd, step, 1.0, 80, 100);
+            assert!((rate - expected).abs() < 1e-7, "{rate} is not {expected}");
+        }
     }
 }

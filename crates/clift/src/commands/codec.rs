@@ -43,8 +43,8 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
         usage_bail!("the codec {} exists; scenes coded with it need it; replace it with --force", out.display());
     }
     let opened = model_args.open_data(args.split)?;
-    let is_shared = args.data.is_none() && opened.shares_scenes;
-    let hold_out = if is_shared { config.data.hold_out } else { 0 };
+    // Also of a DIR, which may be the capture that the run was trained on.
+    let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     let model = model_args.open()?;
     let frames = EvalFrames { split: EvalSplit::Train, hold_out };

@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{ClipReader, DataError, SceneSource, Split, plural};
+use clift_data::{ClipReader, SceneSource, Split, plural};
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
 use clift_model::{
     CodedLoss, ModelError, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TokenKind, TrainedModel,
-    check_output_path,
+    ViewCamera, check_output_path,
 };
 use serde::Serialize;
 
@@ -46,8 +46,9 @@ pub struct EncodeArgs {
     /// Context frames by position or file name [default: spread along the path]
     ///
     /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
-    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. By default, as many as in training; of a DIR of the command line,
-    /// every fourth frame, up to three times as many, if the network has camera-relative attention.
+    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. Numbers alone are positions, unless one begins with a zero:
+    /// `0005` is a name. By default, as many as in training; of a DIR of the command line, every fourth frame, up to three
+    /// times as many, if the network has camera-relative attention.
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
     pub context: Vec<String>,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
@@ -119,11 +120,12 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     }
     let source = model_args.open_data(args.split)?.source;
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
-    let context = frame_positions(&args.context, || source.frame_names(scene))?;
+    let names = source.frame_names(scene)?;
+    let context = frame_positions(&args.context, &names)?;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then_some(context),
-        num_context: model_args.num_context(config.data.views.max_context, reader.source.as_ref(), scene..scene + 1)?,
+        num_context: model_args.num_context(reader.source.as_ref(), scene)?,
         storage: TokenCount::Share(if config.model.has_latents() { 1.0 } else { 0.25 }),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
@@ -138,7 +140,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.save_clusters {
         write_json(&ClustersFile::of(&encoded), path)?;
     }
-    print_result(&describe(&encoded, &written, &args.out))?;
+    print_result(&describe(&encoded, &written, &args.out, &names))?;
+    warn_of_turn(&encoded.scene);
     let photo = reader.source.image_size(scene, encoded.scene.context_frames[0] as usize)?;
     if let Some([width, height]) = cropped(photo, [encoded.scene.width, encoded.scene.height]) {
         print_note(&format!(
@@ -146,7 +149,30 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
             photo[0], photo[1]
         ));
     }
-    print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, given)
+    print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, given, &names)
+}
+
+/// Returns the file name of a frame, or its position if it has no file.
+fn frame_name(names: &[String], frame: usize) -> String {
+    names.get(frame).cloned().unwrap_or_else(|| frame.to_string())
+}
+
+/// Angle between two context views, in degrees, above which `models/rooms` renders noise
+/// (models/rooms/README.md, "Limits").
+const MAX_TURN_DEG: f64 = 140.0;
+
+/// Warns of context views that look at a place from opposite sides.
+fn warn_of_turn(scene: &Scene) {
+    let axes: Vec<[f64; 3]> = scene.context.iter().map(ViewCamera::axis).collect();
+    let cosine = |a: &[f64; 3], b: &[f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let least = axes.iter().flat_map(|a| axes.iter().map(|b| cosine(a, b))).fold(1.0, f64::min);
+    let widest = least.max(-1.0).acos().to_degrees();
+    if widest > MAX_TURN_DEG {
+        print_warning(format!(
+            "context views differ in direction by up to {widest:.0} degrees; models that were trained on one side of a \
+             place, such as models/rooms, render noise there: choose views of one side with --context"
+        ));
+    }
 }
 
 /// Returns the size of the central part of an image that has the proportions of the network's; `None` if little is lost.
@@ -157,17 +183,18 @@ fn cropped(image: [usize; 2], network: [usize; 2]) -> Option<[usize; 2]> {
 }
 
 /// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
-fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> {
+fn print_check(check: Option<HeldOutFrame>, model: &Path, names: &[String]) -> anyhow::Result<()> {
     let Some(HeldOutFrame { frame, psnr, nearest_psnr }) = check else {
         return print_result("check: no frame beside the contexts to compare a rendering with");
     };
+    let frame = frame_name(names, frame);
     print_result(&format!(
         "check: frame {frame}, not a context: {psnr:.2} dB rendered, {nearest_psnr:.2} dB copied from the nearest context"
     ))?;
     if psnr < nearest_psnr {
         print_warning(format!(
             "the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
-             from the training scenes of {}, or the run is not trained enough",
+             from the training scenes of {}, few tokens are stored, or the run is not trained enough",
             model.display()
         ));
     }
@@ -176,21 +203,19 @@ fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> 
 
 /// Returns the positions of frames that are given by position or file name. Numbers alone are positions, unless one has
 /// leading zeros, as names of images have.
-fn frame_positions(
-    frames: &[String],
-    names: impl FnOnce() -> Result<Vec<String>, DataError>,
-) -> anyhow::Result<Vec<usize>> {
-    let is_padded = |frame: &String| frame.len() > 1 && frame.starts_with('0');
-    if !frames.iter().any(is_padded)
+fn frame_positions(frames: &[String], names: &[String]) -> anyhow::Result<Vec<usize>> {
+    let frames: Vec<&str> = frames.iter().map(|frame| frame.trim()).collect();
+    let is_padded = |frame: &str| frame.len() > 1 && frame.starts_with('0');
+    if !frames.iter().any(|frame| is_padded(frame))
         && let Ok(positions) = frames.iter().map(|frame| frame.parse()).collect()
     {
         return Ok(positions);
     }
-    let names = names()?;
-    let position = |frame: &String| {
+    let position = |&frame: &&str| {
         let has_stem = |name: &String| name.rsplit_once('.').is_some_and(|(stem, _)| stem == frame);
         let named = names.iter().position(|name| name == frame).or_else(|| names.iter().position(has_stem));
-        let Some(position) = named.or_else(|| frame.parse().ok()) else {
+        let number = || if is_padded(frame) { None } else { frame.parse().ok() };
+        let Some(position) = named.or_else(number) else {
             let first = names.iter().take(MAX_LISTED_KEYS).map(String::as_str).collect::<Vec<_>>().join(", ");
             match names.len() {
                 0 => usage_bail!("--context {frame}: the frames of this data set have no file names; write positions"),
@@ -281,10 +306,11 @@ fn coded_overhead(num_views: usize, path_len: usize) -> usize {
     400 + path_len + 68 * num_views
 }
 
-fn describe(encoded: &EncodedScene, stored: &str, path: &Path) -> String {
+fn describe(encoded: &EncodedScene, stored: &str, path: &Path, names: &[String]) -> String {
     let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = encoded;
     let num_tokens = scene.num_tokens();
-    let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let frames = scene.context_frames.iter().map(|&frame| frame_name(names, frame as usize));
+    let frames = frames.collect::<Vec<_>>().join(", ");
     let clusters = match scene.kind {
         TokenKind::Latents => String::new(),
         _ => format!("\ntokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}"),
@@ -332,17 +358,19 @@ mod tests {
     fn context_frames_are_positions_or_file_names() {
         let positions = |frames: &[&str]| {
             let frames: Vec<String> = frames.iter().map(ToString::to_string).collect();
-            let names = || Ok(["a.jpg", "b.v2.png", "7.png", "0", "003.jpg"].map(String::from).to_vec());
-            frame_positions(&frames, names).map_err(|error| error.to_string())
+            let names = ["a.jpg", "b.v2.png", "7.png", "0", "003.jpg"].map(String::from);
+            frame_positions(&frames, &names).map_err(|error| error.to_string())
         };
         assert_eq!(positions(&["7", "0"]).unwrap(), [7, 0], "numbers alone are positions");
-        assert_eq!(positions(&["003", "1"]).unwrap(), [4, 1], "with leading zeros, names");
+        assert_eq!(positions(&["003", " 1"]).unwrap(), [4, 1], "with leading zeros, names");
+        let message = positions(&["003", "001"]).unwrap_err();
+        assert!(message.starts_with("--context: no frame 001; the 5 frames"), "{message}");
         assert_eq!(positions(&["b.v2.png", "a", "7.png", "2"]).unwrap(), [1, 0, 2, 2]);
         assert_eq!(
             positions(&["a.jpg", "c.jpg"]).unwrap_err(),
             "--context: no frame c.jpg; the 5 frames start with a.jpg, b.v2.png, 7.png, 0, 003.jpg"
         );
-        let message = frame_positions(&["a.jpg".into()], || Ok(Vec::new())).unwrap_err().to_string();
+        let message = frame_positions(&["a.jpg".into()], &[]).unwrap_err().to_string();
         assert!(message.contains("write positions"), "{message}");
     }
 }

@@ -4,8 +4,8 @@ use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use clift_data::{ClipReader, Split};
-use clift_eval::{EncodeOptions, EvalFrames, evaluation_items};
+use clift_data::{ClipReader, EvaluationItem, SkipReport, Split, ViewIndices};
+use clift_eval::{EncodeOptions, EvalFrames, evaluation_items, spread_contexts};
 use clift_model::{DeviceName, ModelConfig, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
@@ -98,18 +98,23 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let model_args = ModelArgs::find(scene, args.data.as_deref(), &args.overrides)?;
     let opened = model_args.open_data(args.split)?;
     let model = model_args.open()?;
-    let source = opened.source.as_ref();
-    let scenes = 0..source.num_scenes().min(MAX_SCENES);
-    let num_context = model_args.num_context(model_args.config.eval.num_context, source, scenes)?;
-    let ModelArgs { given, mut config, folder, .. } = model_args;
-    require_places(&config.model, &given)?;
-    config.eval.num_context = num_context;
-    let frames = EvalFrames::new(&opened, args.split, config.data.hold_out, folder.is_none());
-    let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
-    if config.eval.num_scenes == 0 {
-        config.eval.num_scenes = MAX_SCENES;
-    }
-    let (items, skip_report, _) = evaluation_items(&config.eval, &reader, frames)?;
+    require_places(&model_args.config.model, &model_args.given)?;
+    let is_training_data = model_args.folder.is_none();
+    let frames = EvalFrames::new(&opened, args.split, model_args.config.data.hold_out, is_training_data);
+    let reader = ClipReader { source: opened.source, options: model_args.config.data.clip_options() };
+    // The index of a run lists frames of its own data.
+    let has_index = args.overrides.set.iter().any(|set| set.starts_with("eval.index"));
+    let (items, skip_report) = if is_training_data || has_index {
+        let mut eval = model_args.config.eval.clone();
+        if eval.num_scenes == 0 {
+            eval.num_scenes = MAX_SCENES;
+        }
+        let (items, skip_report, _) = evaluation_items(&eval, &reader, frames)?;
+        (items, skip_report)
+    } else {
+        folder_items(&model_args, &reader)?
+    };
+    let ModelArgs { given, config, folder, .. } = model_args;
     if skip_report.has_content() {
         print_note(&skip_report.to_string());
     }
@@ -137,6 +142,23 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
         render_args: device_args(args.overrides.device),
     };
     Ok((SceneSet::Run(Box::new(scenes)), config.device))
+}
+
+/// Lists the scenes of a folder with the context views that `clift encode` takes.
+fn folder_items(model_args: &ModelArgs, reader: &ClipReader) -> anyhow::Result<(Vec<EvaluationItem>, SkipReport)> {
+    let source = reader.source.as_ref();
+    let count = source.num_scenes().min(MAX_SCENES);
+    let (mut items, mut skip_report) = (Vec::with_capacity(count), SkipReport::new(count));
+    for scene in 0..count {
+        match spread_contexts(reader, scene, model_args.num_context(source, scene)?) {
+            Ok(context) => items.push(EvaluationItem { scene, views: ViewIndices { context, target: Vec::new() } }),
+            Err(error) => skip_report.skip(source.key(scene), error.to_string()),
+        }
+    }
+    if items.is_empty() {
+        usage_bail!("no scene can be shown: {skip_report}");
+    }
+    Ok((items, skip_report))
 }
 
 /// Refuses latents, which the page could neither show on the context views nor select.

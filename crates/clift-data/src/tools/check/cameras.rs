@@ -3,7 +3,7 @@
 use crate::geometry::camera::Camera;
 use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale};
 use crate::geometry::pose::Pose;
-use crate::tools::check::images::{Sizes, list_frames};
+use crate::tools::check::images::Sizes;
 use crate::tools::check::result::SceneCheck;
 
 /// Plausible fields of view, in degrees.
@@ -60,7 +60,7 @@ fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     });
     if let Some(&first) = implausible.first() {
         let [narrow, wide] = fields(&cameras[first]);
-        let frames = list_frames(&implausible);
+        let frames = check.list_frames(&implausible);
         let what = format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}");
         check.reasons.push(what);
     } else if widest > FILTERED_FOV_DEG {
@@ -76,7 +76,7 @@ fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     });
     if let Some(&first) = outside.first() {
         let k = cameras[first].intrinsics_norm;
-        let frames = list_frames(&outside);
+        let frames = check.list_frames(&outside);
         check.reasons.push(format!(
             "principal point at ({:.3}, {:.3}) of the image in {frames}, expected {low} to {high}",
             k.cx, k.cy

@@ -8,7 +8,7 @@ use crate::skip_report::plural;
 use crate::statistics::{mean, median};
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::frames::{exchange_neighbours, frame_distances, triplet_distances, wrong_frames};
-use crate::tools::check::images::{Sizes, list_frames};
+use crate::tools::check::images::Sizes;
 use crate::tools::check::matches::{FramePair, match_frames};
 use crate::tools::check::mistakes::Mistake;
 use crate::tools::check::result::{FrameCheck, MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
@@ -93,11 +93,12 @@ pub(crate) fn check_poses(
 /// Adds a note on pairs with large distances in a scene that passes.
 fn note_pairs(check: &mut SceneCheck) {
     let far: Vec<&PairCheck> = check.pairs.iter().filter(|pair| pair.epipolar_px > NOTED_PX).collect();
-    if let Some(PairCheck { frames: [a, b], epipolar_px, .. }) = far.first().filter(|_| check.reasons.is_empty()) {
+    if let Some(PairCheck { frames, epipolar_px, .. }) = far.first().filter(|_| check.reasons.is_empty()) {
+        let [a, b] = frames.map(|frame| check.frame_name(frame));
+        let pairs = plural(far.len(), "pair");
         check.notes.push(format!(
-            "{} of frames above {NOTED_PX} px, the first {a} and {b} with {epipolar_px:.1} px: a pattern repeats, or \
-             their poses are wrong",
-            plural(far.len(), "pair")
+            "{pairs} of frames above {NOTED_PX} px, the first {a} and {b} with {epipolar_px:.1} px: a pattern repeats, or \
+             their poses are wrong"
         ));
     }
 }
@@ -112,15 +113,15 @@ fn check_frames(mut views: Vec<PixelCamera>, pairs: &[FramePair], step: usize, c
     check.frames =
         known.filter_map(|(frame, px)| Some(FrameCheck { frame: frame * step, reprojection_px: (*px)? })).collect();
     if !alone.is_empty() {
-        let frames = list_frames(&alone);
+        let frames = check.list_frames(&alone);
         check.notes.push(format!("{frames} were not compared with two others: too few corners in common"));
     }
     for exchanged in exchange_neighbours(&mut views, &triplets) {
-        let (first, [given, new]) = (exchanged.frame * step, exchanged.px);
+        let [given, new] = exchanged.px;
+        let [first, second] = [exchanged.frame, exchanged.frame + 1].map(|frame| check.frame_name(frame * step));
         check.reasons.push(format!(
-            "the cameras of frames {first} and {} are exchanged: the other frames place corners {given:.1} px away, with \
-             the cameras exchanged {new:.1} px",
-            first + step
+            "the cameras of frames {first} and {second} are exchanged: the other frames place corners {given:.1} px away, \
+             with the cameras exchanged {new:.1} px"
         ));
     }
     let wrong = wrong_frames(&views, &triplets);
@@ -131,7 +132,7 @@ fn check_frames(mut views: Vec<PixelCamera>, pairs: &[FramePair], step: usize, c
         check.reasons.push(format!(
             "the cameras of {} do not fit the other frames, which place corners up to {worst:.1} px away (median of all \
              frames {typical:.1})",
-            list_frames(&frames)
+            check.list_frames(&frames)
         ));
     }
 }

@@ -8,11 +8,9 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
-use crate::skip_report::plural;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::features::image_features::Features;
 
-const MAX_NAMED: usize = 5;
 /// Distance of two cameras over the extent of all centres above which equal images contradict the poses.
 const MAX_MOVE: f64 = 0.02;
 /// Angle between two cameras in degrees above which equal images contradict the poses.
@@ -48,7 +46,8 @@ pub(crate) fn check_images(
         read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
     if let Some((_, first)) = failures.first() {
         let frames: Vec<usize> = failures.iter().map(|(frame, _)| *frame).collect();
-        check.reasons.push(format!("{} cannot be read; the first: {first}", list_frames(&frames)));
+        let frames = check.list_frames(&frames);
+        check.reasons.push(format!("{frames} cannot be read; the first: {first}"));
     }
     let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.size)).collect();
     let mut counts: BTreeMap<[usize; 2], usize> = BTreeMap::new();
@@ -79,11 +78,12 @@ fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut
         (if is_moved { &mut contradictions } else { &mut equal }).push(frame);
     }
     if !contradictions.is_empty() {
-        let frames = list_frames(&contradictions);
+        let frames = check.list_frames(&contradictions);
         check.reasons.push(format!("{frames} repeat the image of an earlier frame that has another camera"));
     }
     if !equal.is_empty() {
-        check.notes.push(format!("{} repeat the image and the camera of an earlier frame", list_frames(&equal)));
+        let frames = check.list_frames(&equal);
+        check.notes.push(format!("{frames} repeat the image and the camera of an earlier frame"));
     }
 }
 
@@ -95,11 +95,4 @@ fn camera_distance(a: &Camera, b: &Camera) -> (f64, f64) {
 /// Returns the largest distance of a camera centre from the first.
 fn extent(cameras: &[Camera]) -> f64 {
     cameras.iter().map(|camera| camera_distance(&cameras[0], camera).0).fold(0.0, f64::max)
-}
-
-/// Formats frames as `3 frames (1, 4, 7)`, with dots after the fifth.
-pub(crate) fn list_frames(frames: &[usize]) -> String {
-    let list: Vec<String> = frames.iter().take(MAX_NAMED).map(ToString::to_string).collect();
-    let more = if frames.len() > MAX_NAMED { ", .." } else { "" };
-    format!("{} ({}{more})", plural(frames.len(), "frame"), list.join(", "))
 }

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::skip_report::plural;
+
 /// Median symmetric epipolar distance above which a scene is flagged, in pixels of an image 640 columns wide.
 pub const MAX_EPIPOLAR_PX: f64 = 1.0;
 
@@ -47,9 +49,27 @@ pub struct SceneCheck {
     pub pairs: Vec<PairCheck>,
     /// Frames that share enough corners with two others. Empty if a mistake of all cameras was found.
     pub frames: Vec<FrameCheck>,
+    /// File name of every frame; empty for frames without files of their own.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub frame_names: Vec<String>,
 }
 
+/// Most frames listed in a finding.
+const MAX_NAMED: usize = 5;
+
 impl SceneCheck {
+    /// Returns the file name of a frame, or its position if it has no file.
+    pub(crate) fn frame_name(&self, frame: usize) -> String {
+        self.frame_names.get(frame).cloned().unwrap_or_else(|| frame.to_string())
+    }
+
+    /// Formats frames as `3 frames (1, 4, 7)`, with dots after the fifth.
+    pub(crate) fn list_frames(&self, frames: &[usize]) -> String {
+        let list: Vec<String> = frames.iter().take(MAX_NAMED).map(|&frame| self.frame_name(frame)).collect();
+        let more = if frames.len() > MAX_NAMED { ", .." } else { "" };
+        format!("{} ({}{more})", plural(frames.len(), "frame"), list.join(", "))
+    }
+
     /// Sets the verdict from the findings.
     pub(crate) fn judge(&mut self) {
         self.verdict = match (self.reasons.is_empty(), self.epipolar_px) {

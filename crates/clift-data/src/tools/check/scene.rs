@@ -37,6 +37,8 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
         }
     };
     check.num_frames = cameras.len();
+    // Without names the findings have positions.
+    check.frame_names = source.frame_names(scene).unwrap_or_default();
     let step = cameras.len().div_ceil(MAX_COMPARED).max(1);
     if step > 1 {
         check.notes.push(format!("poses were compared with the images of every {step}. frame"));

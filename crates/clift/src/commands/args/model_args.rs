@@ -1,6 +1,5 @@
 //! A trained model with the data that a command reads: those of its run, or a folder.
 
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use clift_data::{
@@ -81,24 +80,18 @@ impl ModelArgs {
         Ok(opened)
     }
 
-    /// Returns the default number of context views of these scenes: `trained`, as in training. Of scenes of a folder, a
-    /// network with camera-relative attention takes one for every fourth frame, up to three times as many as in training:
-    /// further views improve its renderings (models/rooms/README.md).
+    /// Returns the default number of context views of a scene: as many as in training. Of a scene of the folder, a network
+    /// with camera-relative attention takes one for every fourth frame, up to three times as many as in training: further
+    /// views improve its renderings (models/rooms/README.md).
     ///
     /// # Errors
     /// Those of counting the frames.
-    pub fn num_context(
-        &self,
-        trained: usize,
-        source: &dyn SceneSource,
-        scenes: Range<usize>,
-    ) -> Result<usize, DataError> {
+    pub fn num_context(&self, source: &dyn SceneSource, scene: usize) -> Result<usize, DataError> {
+        let trained = self.config.data.views.max_context;
         if self.folder.is_none() || self.config.model.camera_encoding == CameraEncoding::Plucker {
             return Ok(trained);
         }
-        let lengths = scenes.map(|scene| source.num_frames(scene)).collect::<Result<Vec<_>, _>>()?;
-        let shortest = lengths.into_iter().min().unwrap_or_default();
-        Ok((shortest / 4).clamp(trained, 3 * trained))
+        Ok((source.num_frames(scene)? / 4).clamp(trained, 3 * trained))
     }
 
     /// Reads the weights.

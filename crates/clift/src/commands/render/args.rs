@@ -65,7 +65,7 @@ pub struct RenderArgs {
 pub enum CameraPath {
     /// Through the context views.
     Interpolate,
-    /// Once around the point that the context views look at.
+    /// Around a small ellipse about the mean context view, facing the point that the context views look at.
     Orbit,
     File(PathBuf),
 }

@@ -173,8 +173,10 @@ fn token_count(
     }
     let Some(count) = times.most_tokens(budget_ms / 1e3) else {
         let least_ms = (1e4 * times.least_s()).ceil() / 10.0;
+        let grids = args.patch_grids.unwrap_or(scene.model.patch_grids);
+        let fewer = if grids == PatchGrids::One { "" } else { "write --patch-grids 1, " };
         usage_bail!(
-            "the fastest frame takes {least_ms} ms on this device; raise --budget-ms or choose a smaller --size"
+            "the fastest frame takes {least_ms} ms on this device; {fewer}raise --budget-ms or choose a smaller --size"
         );
     };
     print_note(&format!("{budget_ms} ms per frame: {count} of {num_storage_tokens} tokens"));
@@ -193,11 +195,14 @@ fn path_cameras(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -
         CameraPath::Interpolate => interpolate_path(&context, args.frames.unwrap_or(DEFAULT_FRAMES)),
         CameraPath::Orbit => orbit_path(&context, args.frames.unwrap_or(DEFAULT_FRAMES)),
         CameraPath::File(file) => {
-            if args.frames.is_some() {
-                usage_bail!("a file of poses determines the number of frames; remove --frames");
-            }
             if !file.exists() {
                 usage_bail!("--path {}: no such file; write interpolate, orbit or a file of poses", file.display());
+            }
+            if file.is_dir() {
+                usage_bail!("--path {}: a folder; write its transforms.json or a file of poses", file.display());
+            }
+            if args.frames.is_some() {
+                usage_bail!("a file of poses determines the number of frames; remove --frames");
             }
             let mean_c2w = Pose::from_matrix(&scene.world.mean_c2w)?;
             let frame = PoseNormalization { mean_c2w, scale: scene.world.scale };
