@@ -259,12 +259,13 @@ class CondenserBlock(nn.Module):
     `residual=False` follows the equations as printed: no residual inside the
     block, and a centroid that is alone in its cluster keeps equation 1's value.
     `residual=True` adds a residual around each of the three layers, and a norm
-    before the cluster attention's query.
+    before the cluster attention's query. `member_share=True` multiplies what
+    equation 4 adds by the share of keys among the tokens of a cluster.
     """
 
-    def __init__(self, dim: int, num_heads: int, feed_forward_dim: int, residual: bool):
+    def __init__(self, dim: int, num_heads: int, feed_forward_dim: int, residual: bool, member_share: bool):
         super().__init__()
-        self.residual = residual
+        self.residual, self.member_share = residual, member_share
         self.norm_self = nn.LayerNorm(dim)
         self.self_attn = nn.MultiheadAttention(dim, num_heads, batch_first=True)
         if residual:
@@ -289,7 +290,9 @@ class CondenserBlock(nn.Module):
             gathered = self.cluster_attn(x, memory, mask)  # equation 2
             y = torch.where(mask.any(-1, keepdim=True), gathered, x)
             z = self.feed_forward(self.norm_ff(y))  # equation 3
-        return centroids + self.gate(z)  # equation 4
+        count = mask.sum(-1, keepdim=True).to(z.dtype)
+        share = count / (count + 1) if self.member_share else 1
+        return centroids + share * self.gate(z)  # equation 4
 
 
 def cluster_mask(assignment: Tensor, centroid_index: Tensor) -> Tensor:
@@ -308,10 +311,18 @@ def cluster_mask(assignment: Tensor, centroid_index: Tensor) -> Tensor:
 class Condenser(nn.Module):
     """Writes what each cluster knows into its centroid (variant `paper`)."""
 
-    def __init__(self, dim: int, num_heads: int, num_blocks: int, feed_forward_dim: int, residual: bool):
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        num_blocks: int,
+        feed_forward_dim: int,
+        residual: bool,
+        member_share: bool = False,
+    ):
         super().__init__()
         self.blocks = nn.ModuleList(
-            CondenserBlock(dim, num_heads, feed_forward_dim, residual) for _ in range(num_blocks)
+            CondenserBlock(dim, num_heads, feed_forward_dim, residual, member_share) for _ in range(num_blocks)
         )
 
     def forward(self, lift: Tensor, assignment: Tensor, centroid_index: Tensor) -> Tensor:

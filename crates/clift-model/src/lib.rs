@@ -102,7 +102,7 @@ pub use network::layers::Part;
 // Weight files and trained models
 pub use weights::file::{first_not_f32, load_part, save_part, save_part_f16, save_weights, sorted_header};
 pub use weights::hash::weights_hash;
-pub use weights::model_path::{ModelPath, check_sizes, refuse_checkpoint};
+pub use weights::model_path::{ModelPath, check_condenser, check_sizes, refuse_checkpoint};
 pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };

@@ -107,6 +107,7 @@ fn config_page_is_current() {
         ("model.num_latents", Value::try_from(model.num_latents)),
         ("model.camera_encoding", Value::try_from(model.camera_encoding)),
         ("model.patch_grids", Value::try_from(model.patch_grids)),
+        ("model.condenser.member_share", Value::try_from(model.condenser.member_share)),
     ];
     for (path, value) in omitted {
         let (sections, key) = path.rsplit_once('.').expect("a section");

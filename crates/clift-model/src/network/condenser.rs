@@ -39,6 +39,8 @@ struct CondenserBlock {
     feed_forward: FeedForward,
     /// `W_z` of equation 4, zero at the start.
     gate: Linear,
+    /// Whether a cluster's share of members multiplies what equation 4 adds.
+    member_share: bool,
 }
 
 impl Condenser {
@@ -84,6 +86,7 @@ impl CondenserBlock {
             norm_ff: init.layer_norm(dim),
             feed_forward: FeedForward::new(dim, config.feed_forward_dim, init),
             gate: init.zero_linear(dim, dim),
+            member_share: config.condenser.member_share,
         }
     }
 
@@ -97,7 +100,12 @@ impl CondenserBlock {
             None => eq1,
         };
         let eq3 = self.residual(&eq2, self.feed_forward.forward(&self.norm_ff, eq2.clone()));
-        Tokens { values: centroids + linear_in_f32(&self.gate, eq3), transforms } // equation 4
+        let mut update = linear_in_f32(&self.gate, eq3);
+        if self.member_share {
+            let share = clusters.member_share.clone().cast(update.dtype());
+            update = update * share;
+        }
+        Tokens { values: centroids + update, transforms } // equation 4
     }
 
     /// Equation 2: each centroid attends to the members of its cluster. A cluster of one token has no keys and keeps the
@@ -154,12 +162,14 @@ mod tests {
     }
 
     #[test]
-    fn equals_dense_masked_attention_with_gradients_in_both_forms() {
-        for (name, residual) in [("condenser", false), ("condenser_residual", true)] {
+    fn equals_dense_masked_attention_with_gradients_in_all_forms() {
+        for (name, residual, member_share) in
+            [("condenser", false, false), ("condenser_residual", true, false), ("condenser_member_share", true, true)]
+        {
             let fixture = Fixture::open(name);
             let clusters = fixture_clusters(&fixture);
             let mut config = config(CliftVariant::Paper);
-            config.condenser.residual = residual;
+            config.condenser = CondenserConfig { residual, member_share, ..config.condenser };
             for device in devices() {
                 let device = device.autodiff();
                 let condenser = Condenser::new(&config, &mut Init::new(0, &device));

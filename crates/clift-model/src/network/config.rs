@@ -51,6 +51,10 @@ pub struct CondenserConfig {
     /// Whether each step of a block adds its input to its output ("Add & `LayerNorm`" of the paper's text), or returns the
     /// output alone, as equations 1 to 3 print it.
     pub residual: bool,
+    /// Whether equation 4 multiplies what it adds to a centroid by the share of members among the cluster's tokens,
+    /// `(n - 1) / n` for `n` tokens: a cluster of one token keeps it as it is.
+    #[serde(skip_serializing_if = "is_default")]
+    pub member_share: bool,
 }
 
 impl Default for ModelConfig {
@@ -66,11 +70,11 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 
 impl CondenserConfig {
     /// No condenser.
-    pub const NONE: Self = Self { num_blocks: 0, residual: true };
+    pub const NONE: Self = Self { num_blocks: 0, residual: true, member_share: false };
 
     /// Returns the condenser of a variant.
     pub fn of(variant: CliftVariant) -> Self {
-        Self { num_blocks: if variant.is_released() { 1 } else { 2 }, residual: true }
+        Self { num_blocks: if variant.is_released() { 1 } else { 2 }, ..Self::NONE }
     }
 }
 
@@ -98,6 +102,7 @@ struct ModelSection {
 struct CondenserSection {
     num_blocks: Option<usize>,
     residual: Option<bool>,
+    member_share: bool,
 }
 
 impl From<ModelSection> for ModelConfig {
@@ -124,6 +129,7 @@ impl From<ModelSection> for ModelConfig {
             condenser: CondenserConfig {
                 num_blocks: section.condenser.num_blocks.unwrap_or(defaults.num_blocks),
                 residual: section.condenser.residual.unwrap_or(defaults.residual),
+                member_share: section.condenser.member_share,
             },
         }
     }
@@ -280,7 +286,7 @@ impl ModelConfig {
             let fix = "of LVSM, write \"paper\" or \"released-re10k\", its network in CLiFT's release".to_owned();
             return if variant.has_norms() { bad("model.variant", variant.to_string(), fix) } else { Ok(()) };
         }
-        let CondenserConfig { num_blocks, residual } = self.condenser;
+        let CondenserConfig { num_blocks, residual, member_share } = self.condenser;
         if variant.is_released() && num_blocks != 1 {
             let fix = format!("model.variant = \"{variant}\" has one: leave the key out");
             return bad("model.condenser.num_blocks", num_blocks.to_string(), fix);
@@ -288,6 +294,10 @@ impl ModelConfig {
         if variant.is_released() && !residual {
             let fix = format!("the block of model.variant = \"{variant}\" has residuals: leave the key out");
             return bad("model.condenser.residual", residual.to_string(), fix);
+        }
+        if variant.is_released() && member_share {
+            let fix = format!("the block of model.variant = \"{variant}\" adds the whole update: leave the key out");
+            return bad("model.condenser.member_share", member_share.to_string(), fix);
         }
         Ok(())
     }
@@ -330,6 +340,8 @@ mod tests {
         );
         let plain = message(r#"{"variant": "released-dl3dv", "condenser": {"residual": false}}"#);
         assert!(plain.starts_with("`model.condenser.residual` = false"), "{plain}");
+        let shared = message(r#"{"variant": "released-re10k", "condenser": {"member_share": true}}"#);
+        assert!(shared.starts_with("`model.condenser.member_share` = true"), "{shared}");
         assert!(serde_json::from_str::<ModelConfig>(r#"{"depth": 1}"#).is_err());
         assert!(serde_json::from_str::<ModelConfig>(r#"{"condenser": {"depth": 1}}"#).is_err());
     }

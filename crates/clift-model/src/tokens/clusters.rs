@@ -121,7 +121,7 @@ impl Clusters {
         let mut member = Vec::with_capacity(batch * num_members);
         let mut segment = Vec::with_capacity(batch * num_members);
         let mut all_segments = Vec::with_capacity(batch * num_tokens);
-        let mut singleton = vec![true; batch * num_storage_tokens];
+        let mut num_members_of = vec![0_u32; batch * num_storage_tokens];
         for (scene, clusters) in self.scenes.iter().enumerate() {
             centroid
                 .extend(clusters.centroid_index.iter().map(|&token| (scene * num_tokens) as i64 + i64::from(token)));
@@ -131,7 +131,7 @@ impl Clusters {
                     let row = scene * num_storage_tokens + cluster as usize;
                     member.push((scene * num_tokens + token) as i64);
                     segment.push(row as i64);
-                    singleton[row] = false;
+                    num_members_of[row] += 1;
                 }
             }
         }
@@ -139,6 +139,9 @@ impl Clusters {
             let count = values.len();
             Tensor::<1, Int>::from_data(TensorData::new(values, [count]), device)
         };
+        let per_cluster = [batch, num_storage_tokens, 1];
+        let singleton: Vec<bool> = num_members_of.iter().map(|&count| count == 0).collect();
+        let member_share: Vec<f32> = num_members_of.iter().map(|&count| count as f32 / (count + 1) as f32).collect();
         ClusterIndex {
             batch,
             num_tokens,
@@ -146,9 +149,10 @@ impl Clusters {
             centroid: index(centroid),
             segment: index(all_segments),
             members: (num_members > 0).then(|| Members { token: index(member), segment: index(segment) }),
-            singleton: singleton.contains(&true).then(|| {
-                Tensor::<3, Bool>::from_data(TensorData::new(singleton, [batch, num_storage_tokens, 1]), device)
-            }),
+            singleton: singleton
+                .contains(&true)
+                .then(|| Tensor::<3, Bool>::from_data(TensorData::new(singleton, per_cluster), device)),
+            member_share: Tensor::<3>::from_data(TensorData::new(member_share, per_cluster), device),
         }
     }
 }
@@ -168,6 +172,8 @@ pub struct ClusterIndex {
     pub(crate) members: Option<Members>,
     /// Whether a cluster has one token, `[B, S, 1]`; `None` without such clusters.
     pub(crate) singleton: Option<Tensor<3, Bool>>,
+    /// Share of members among the tokens of a cluster, `[B, S, 1]`: 0 for a cluster of one token.
+    pub(crate) member_share: Tensor<3>,
 }
 
 #[derive(Clone, Debug)]

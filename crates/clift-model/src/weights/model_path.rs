@@ -103,9 +103,8 @@ pub fn refuse_checkpoint(path: &Path) -> Result<(), ModelError> {
 /// # Errors
 /// [`ModelError::BadConfig`] with the first other size, [`ModelError::BadConfigFile`] for a config that cannot be read.
 pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
-    let Some(found) = read_config(dir)? else { return Ok(()) };
-    let sizes = |config: &ModelConfig| {
-        [
+    check_equal(model, dir, |config| {
+        vec![
             ("model.num_heads", config.num_heads.to_string()),
             ("model.architecture", config.architecture.to_string()),
             ("model.camera_encoding", config.camera_encoding.to_string()),
@@ -116,8 +115,24 @@ pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
             ("model.num_renderer_blocks", config.num_renderer_blocks.to_string()),
             ("model.num_latents", config.num_latents.to_string()),
         ]
-    };
-    let mut pairs = sizes(model).into_iter().zip(sizes(&found));
+    })
+}
+
+/// Checks what tensor shapes do not determine in the condenser, for weights with a trained one.
+///
+/// # Errors
+/// As [`check_sizes`].
+pub fn check_condenser(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
+    check_equal(model, dir, |config| vec![("model.condenser.member_share", config.condenser.member_share.to_string())])
+}
+
+fn check_equal(
+    model: &ModelConfig,
+    dir: &Path,
+    values: impl Fn(&ModelConfig) -> Vec<(&'static str, String)>,
+) -> Result<(), ModelError> {
+    let Some(found) = read_config(dir)? else { return Ok(()) };
+    let mut pairs = values(model).into_iter().zip(values(&found));
     let Some(((key, value), (_, of_weights))) = pairs.find(|(own, other)| own != other) else { return Ok(()) };
     let path = dir.join("config.toml");
     let fix = format!("the weights are of a network with {of_weights}; write the same: {}", path.display());
@@ -201,6 +216,8 @@ mod tests {
         let message = check("[model]\nnum_encoder_blocks = 7", 8).unwrap_err();
         assert!(message.contains("`model.num_encoder_blocks` = 6: "), "{message}");
         assert!(check("[model]\ncamera_encoding = \"gta\"", 8).unwrap_err().contains("a network with gta; "));
-        assert_eq!(check("[model.condenser]\nresidual = false", 8), Ok(()), "stage 2 may have another condenser");
+        assert_eq!(check("[model.condenser]\nmember_share = true", 8), Ok(()), "stage 2 may have another condenser");
+        let message = check_condenser(&ModelConfig::default(), folder.path()).unwrap_err().to_string();
+        assert!(message.contains("`model.condenser.member_share` = false: "), "{message}");
     }
 }

@@ -53,7 +53,7 @@ fn probe(variant: CliftVariant) -> ModelConfig {
         num_encoder_blocks: 1,
         num_renderer_blocks: 1,
         patch_size: 8,
-        condenser: CondenserConfig { num_blocks: 1, residual: true },
+        condenser: CondenserConfig { num_blocks: 1, ..CondenserConfig::of(variant) },
         ..ModelConfig::default()
     }
 }

@@ -14,7 +14,7 @@ use crate::network::init::Init;
 use crate::network::renderer::Renderer;
 use crate::weights::file::{load_module, load_part};
 use crate::weights::hash::{renderer_hash, weights_hash};
-use crate::weights::model_path::{ModelPath, check_sizes};
+use crate::weights::model_path::{ModelPath, check_condenser, check_sizes};
 
 /// A network with trained weights, on a device without autodiff.
 #[derive(Clone, Debug)]
@@ -40,7 +40,9 @@ impl TrainedModel {
         let mut network = Clift::new(config, 0, device);
         let mut loaded = load_part(&mut network, &PathFilter::all(), &path.weights)?;
         let has_condenser = loaded.applied.iter().any(|name| is_condenser(name));
-        if !has_condenser {
+        if has_condenser {
+            check_condenser(config, &path.dir)?;
+        } else {
             loaded.missing.retain(|name| !is_condenser(name));
         }
         loaded.require_all(&path.weights)?;

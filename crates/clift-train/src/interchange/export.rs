@@ -82,6 +82,10 @@ fn export_published(
         let fix = "published networks have plain attention; only runs with \"plucker\" are exported";
         return Err(bad("model.camera_encoding", config.model.camera_encoding, fix));
     }
+    if config.model.condenser.member_share {
+        let fix = "published condensers add the whole update; only runs with false are exported";
+        return Err(bad("model.condenser.member_share", true, fix));
+    }
     let convolutions = match ImportRecord::read(&model.dir)? {
         Some(imported) => imported.convolutions,
         None => PROJECTIONS.map(String::from).into(),

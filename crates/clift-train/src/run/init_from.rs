@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_model::{Clift, ModelPath, check_sizes, load_part, refuse_checkpoint};
+use clift_model::{Clift, ModelPath, check_condenser, check_sizes, load_part, refuse_checkpoint};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
@@ -31,6 +31,9 @@ pub(crate) fn init_from(
     // The sizes of a weight file without a config are unknown.
     if let Ok(found) = ModelPath::find(path) {
         check_sizes(&config.model, &found.dir)?;
+        if stage == Stage::Stage2 {
+            check_condenser(&config.model, &found.dir)?;
+        }
     }
     let mut loaded = load_part(&mut model, &part, path)?;
     if loaded.applied.is_empty() {
