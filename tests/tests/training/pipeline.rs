@@ -231,6 +231,19 @@ fn runs_start_from_weights_of_other_runs() {
     };
     assert!(!condenser("first").is_empty());
     assert_eq!(condenser("seventh"), condenser("first"));
+    let other = [&from_first[..], "model.condenser.member_share=true"];
+    place.train("eighth", &other).fails_with(2, &["`model.condenser.member_share` = true"]);
+}
+
+#[test]
+fn condensers_with_member_share_have_no_published_form() {
+    let place = Place::new();
+    let share = "model.condenser.member_share=true";
+    place.train("run --only stage1", &[share]).ok();
+    place.clift("export DIR/run --format pytorch -o DIR/stage1.ckpt").ok();
+    place.train("run", &[share]).ok();
+    let expected = "`model.condenser.member_share` = true: published condensers add the whole update";
+    place.clift("export DIR/run --format pytorch -o DIR/run.ckpt").fails_with(2, &[expected]);
 }
 
 #[cfg(not(feature = "mpi"))]

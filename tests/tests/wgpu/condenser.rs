@@ -52,7 +52,10 @@ pub const CASES: &[Case] = &[
 ];
 
 fn paper(residual: bool) -> ModelConfig {
-    ModelConfig { condenser: CondenserConfig { num_blocks: 2, residual, member_share: false }, ..network(CliftVariant::Paper) }
+    ModelConfig {
+        condenser: CondenserConfig { num_blocks: 2, residual, member_share: false },
+        ..network(CliftVariant::Paper)
+    }
 }
 
 fn condense(place: &Place, config: &ModelConfig, lift: Tensor<3>, scenes: Vec<SceneClusters>) -> Values {

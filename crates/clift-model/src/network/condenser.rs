@@ -53,6 +53,17 @@ impl Condenser {
         Self { blocks, released: None }
     }
 
+    /// Sets the gates to zero: the condenser returns the centroids unchanged, as an untrained one does.
+    #[must_use]
+    pub fn close_gates(mut self) -> Self {
+        let gates = self.blocks.iter_mut().map(|block| &mut block.gate);
+        for gate in gates.chain(self.released.iter_mut().map(|released| &mut released.gate)) {
+            gate.weight = gate.weight.clone().map(|weight| weight.zeros_like());
+            gate.bias = gate.bias.take().map(|bias| bias.map(|values| values.zeros_like()));
+        }
+        self
+    }
+
     /// Compresses every cluster of tokens into its centroid. The cost is linear in `num_tokens`, because a token is a
     /// key of its own centroid only.
     ///

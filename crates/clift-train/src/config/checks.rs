@@ -71,6 +71,10 @@ impl Config {
         if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
             return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
         }
+        let interpolation = stage2.weight_interpolation;
+        if !(interpolation > 0.0 && interpolation <= 1.0) {
+            return Err(bad("stage2.weight_interpolation", interpolation, "write a number above 0, at most 1"));
+        }
         Ok(())
     }
 

@@ -283,6 +283,8 @@ pub struct Stage2Config {
     pub accumulate: usize,
     /// Learning rate of the renderer, as a factor of the condenser's.
     pub renderer_lr_factor: f64,
+    /// Position of the saved weights on the line from those at the start of the stage (0) to the trained ones (1).
+    pub weight_interpolation: f64,
     /// Run or model directory, or `model.safetensors`, of the initial condenser.
     pub init_from: Option<PathBuf>,
     /// Settings of the optimizer.
@@ -296,6 +298,7 @@ impl Default for Stage2Config {
             batch_size: 80,
             accumulate: 1,
             renderer_lr_factor: 0.1,
+            weight_interpolation: 1.0,
             init_from: None,
             optimizer: OptimizerConfig::default(),
         }

@@ -82,17 +82,17 @@ fn export_published(
         let fix = "published networks have plain attention; only runs with \"plucker\" are exported";
         return Err(bad("model.camera_encoding", config.model.camera_encoding, fix));
     }
-    if config.model.condenser.member_share {
-        let fix = "published condensers add the whole update; only runs with false are exported";
-        return Err(bad("model.condenser.member_share", true, fix));
-    }
     let convolutions = match ImportRecord::read(&model.dir)? {
         Some(imported) => imported.convolutions,
         None => PROJECTIONS.map(String::from).into(),
     };
     let mut ours = read_parameters(&model.weights)?;
-    let bad = |reason: String| TrainError::bad_file("weight file", &model.weights)(reason);
     let has_condenser = ours.keys().any(|path| path.starts_with("condenser."));
+    if has_condenser && config.model.condenser.member_share {
+        let fix = "published condensers add the whole update; only runs with false are exported";
+        return Err(bad("model.condenser.member_share", true, fix));
+    }
+    let bad = |reason: String| TrainError::bad_file("weight file", &model.weights)(reason);
     let mut tensors: Vec<HostTensor> = Vec::new();
     for tensor in published_tensors(&config.model, has_condenser) {
         let mut values = Vec::new();

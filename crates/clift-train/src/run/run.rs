@@ -18,7 +18,7 @@ use clift_model::{
 use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_resume_log;
-use crate::config::config::Config;
+use crate::config::config::{Config, Stage2Config};
 use crate::distributed::machine::open_device;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
@@ -34,6 +34,7 @@ use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
 use crate::run::training_data::TrainingData;
 use crate::run::validation::{EvalRequest, Validation};
+use crate::stage::interpolation::interpolate;
 use crate::stage::settings::StageSettings;
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
@@ -156,8 +157,9 @@ impl Run {
             sink.event(&Event::Warning(warning));
         }
         let train_stage2 = wanted(Stage::Stage2) && !has_stage2;
-        if train_stage2 && !self.folder("stage2").join("checkpoints").exists() {
-            // A wrong `stage2.init_from` is found before stage 1 takes its time.
+        let needs_start = self.config.stage2.weight_interpolation < 1.0;
+        if train_stage2 && (needs_start || !self.folder("stage2").join("checkpoints").exists()) {
+            // A wrong `stage2.init_from` is found before the stages take their time.
             init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?;
         }
         let stage1 = if wanted(Stage::Stage1) && !has_stage1 {
@@ -294,10 +296,33 @@ impl Run {
         // The condenser of stage 1 takes no gradient.
         let start = |sink: &mut dyn Sink| {
             let initial = init_from(self.new_model(), &self.config, Stage::Stage2, sink)?;
-            Ok(Clift { condenser: initial.condenser, ..stage1 })
+            Ok(Clift { condenser: initial.condenser, ..stage1.clone() })
         };
-        let model = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?;
-        self.ranks.from_root(|| Ok(save_weights(&model, &self.weights(Stage::Stage2))?))
+        let trained = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?.valid();
+        self.ranks.from_root(|| {
+            let model = self.interpolate(&start, trained, sink)?;
+            Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
+        })
+    }
+
+    /// Returns the weights that stage 2 saves: `stage2.weight_interpolation` of the way from those it started from.
+    fn interpolate(
+        &self,
+        start: &impl Fn(&mut dyn Sink) -> Result<Clift, TrainError>,
+        trained: Clift,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let Stage2Config { weight_interpolation: position, init_from, .. } = &self.config.stage2;
+        if *position == 1.0 {
+            return Ok(trained);
+        }
+        let mut start = start(&mut |_: &Event| {})?.valid();
+        if init_from.is_none() {
+            // An untrained condenser returns the centroids unchanged, whatever its other weights are.
+            start.condenser = trained.condenser.clone().close_gates();
+        }
+        sink.event(&Event::Message(format!("stage2: saving the weights at {position} of the way from its start")));
+        Ok(interpolate(&start, trained, *position))
     }
 
     fn parts(&self, stage: Stage) -> BatchParts {
