@@ -295,9 +295,7 @@ fn prepare(base: &Path) {
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
     let mut rooms = ["train", "configs/rooms.toml"].map(str::to_owned).to_vec();
     shrink(&mut rooms);
-    // `models/rooms`, whose condenser `capture.toml` continues, does not have the option.
-    let changes = ["--set", "run_dir=runs/rooms", "--set", "model.condenser.member_share=false"];
-    rooms.extend(changes.map(str::to_owned));
+    rooms.extend(["--set", "run_dir=runs/rooms"].map(str::to_owned));
     clift(&rooms.iter().map(String::as_str).collect::<Vec<_>>());
     for name in ["runs/capture", "runs/attic"] {
         copy(&base.join("runs/rooms"), name);

@@ -201,7 +201,7 @@ Examples:
 Examples:
   clift export models/re10k --format pytorch -o re10k.ckpt
   clift export runs/re10k/stage1/model.safetensors --format safetensors -o stage1.safetensors
-  clift export runs/rooms --format f16 -o models/rooms")]
+  clift export runs/rooms --format f16 -o models/my-rooms")]
     Export(ExportArgs),
     /// Print the completion script of a shell
     #[command(after_help = "\

@@ -148,6 +148,7 @@ impl CondenserBlock {
 
 #[cfg(test)]
 mod tests {
+    use burn::module::{ModuleMapper, Param};
     use burn::tensor::DType;
 
     use super::*;
@@ -250,16 +251,26 @@ mod tests {
         }
     }
 
+    struct PlusOne;
+    impl ModuleMapper for PlusOne {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            param.map(|tensor| tensor + 1.0)
+        }
+    }
+
     #[test]
-    fn an_untrained_condenser_returns_the_centroids() {
+    fn a_condenser_with_closed_gates_returns_the_centroids() {
         for (device, variant) in devices().into_iter().flat_map(|device| CliftVariant::ALL.map(|v| (device.clone(), v)))
         {
-            let condenser = Condenser::new(&config(variant), &mut Init::new(0, &device));
+            let untrained = Condenser::new(&config(variant), &mut Init::new(0, &device));
+            let closed = untrained.clone().map(&mut PlusOne).close_gates();
             let lift = random([2, 6, 16], 1, &device).cast(DType::F32);
             let scene = SceneClusters::new(vec![0, 1, 1, 0, 0, 1], vec![3, 2]).expect("valid");
             let index = Clusters::new(vec![scene.clone(), scene]).expect("equal").upload(&device);
             let expected = index.gather(lift.clone(), &index.centroid);
-            assert_close(&condenser.forward(lift, &index).values, &expected, 0.0);
+            for condenser in [untrained, closed] {
+                assert_close(&condenser.forward(lift.clone(), &index).values, &expected, 0.0);
+            }
         }
     }
 }

@@ -283,7 +283,8 @@ pub struct Stage2Config {
     pub accumulate: usize,
     /// Learning rate of the renderer, as a factor of the condenser's.
     pub renderer_lr_factor: f64,
-    /// Position of the saved weights on the line from those at the start of the stage (0) to the trained ones (1).
+    /// Position of the saved weights on the line from those at the start of the stage (0) to the trained ones (1); of a
+    /// condenser that starts untrained, the position of the gates. Checkpoints and validations have the trained weights.
     pub weight_interpolation: f64,
     /// Run or model directory, or `model.safetensors`, of the initial condenser.
     pub init_from: Option<PathBuf>,

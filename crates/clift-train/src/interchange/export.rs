@@ -44,8 +44,9 @@ pub struct Exported {
 /// the keys of published checkpoints, `transformer.` before each, and the token codec beside them.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] if `out` exists, or if a network with camera-relative attention or of LVSM has no published keys,
-/// [`TrainError::BadFile`] if the weight file does not fit the config, and those of reading and writing.
+/// [`TrainError::BadConfig`] if `out` exists, or if there are no published keys: of networks with camera-relative attention, of
+/// LVSM, and of condensers with `member_share`; [`TrainError::BadFile`] if the weight file does not fit the config, and those of
+/// reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
     match format {
         ExportFormat::F16 => export_f16(config, model, out),

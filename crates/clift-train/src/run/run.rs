@@ -296,32 +296,28 @@ impl Run {
         // The condenser of stage 1 takes no gradient.
         let start = |sink: &mut dyn Sink| {
             let initial = init_from(self.new_model(), &self.config, Stage::Stage2, sink)?;
-            Ok(Clift { condenser: initial.condenser, ..stage1.clone() })
+            Ok(Clift { condenser: initial.condenser, ..stage1 })
         };
         let trained = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?.valid();
-        self.ranks.from_root(|| {
-            let model = self.interpolate(&start, trained, sink)?;
-            Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
-        })
+        self.ranks.from_root(|| Ok(save_weights(&self.interpolate(trained, sink)?, &self.weights(Stage::Stage2))?))
     }
 
     /// Returns the weights that stage 2 saves: `stage2.weight_interpolation` of the way from those it started from.
-    fn interpolate(
-        &self,
-        start: &impl Fn(&mut dyn Sink) -> Result<Clift, TrainError>,
-        trained: Clift,
-        sink: &mut dyn Sink,
-    ) -> Result<Clift, TrainError> {
-        let Stage2Config { weight_interpolation: position, init_from, .. } = &self.config.stage2;
+    fn interpolate(&self, trained: Clift, sink: &mut dyn Sink) -> Result<Clift, TrainError> {
+        let Stage2Config { weight_interpolation: position, init_from: from, .. } = &self.config.stage2;
         if *position == 1.0 {
             return Ok(trained);
         }
-        let mut start = start(&mut |_: &Event| {})?.valid();
-        if init_from.is_none() {
+        let condenser = if from.is_some() {
+            init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?.valid().condenser
+        } else {
             // An untrained condenser returns the centroids unchanged, whatever its other weights are.
-            start.condenser = trained.condenser.clone().close_gates();
-        }
-        sink.event(&Event::Message(format!("stage2: saving the weights at {position} of the way from its start")));
+            trained.condenser.clone().close_gates()
+        };
+        let start = Clift { condenser, ..self.load_stage1(None)?.valid() };
+        sink.event(&Event::Message(format!(
+            "stage2: saving the weights at {position} of the way from its start; checkpoints and validations have those at its end"
+        )));
         Ok(interpolate(&start, trained, *position))
     }
 

@@ -6,7 +6,8 @@ use std::collections::VecDeque;
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
-/// Returns `start + position * (trained - start)` for every parameter of two modules with the same parameters.
+/// Returns `start + position * (trained - start)` for every parameter of two modules with the same parameters. Equal
+/// values stay equal bit for bit, -0 too.
 pub(crate) fn interpolate<M: Module>(start: &M, trained: M, position: f64) -> M {
     let mut values = Values::default();
     start.visit(&mut values);
@@ -33,7 +34,7 @@ impl ModuleMapper for Interpolation {
         let start = self.start.0.pop_front().expect("modules with the same parameters");
         param.map(|trained| {
             let start = start.reshape(trained.dims());
-            start.clone() + (trained - start).mul_scalar(self.position)
+            trained.clone() - (trained - start).mul_scalar(1.0 - self.position)
         })
     }
 }
@@ -73,7 +74,15 @@ mod tests {
 
     #[test]
     fn equal_weights_stay_equal_bit_for_bit() {
-        let start = model(1);
+        struct Negative;
+        impl ModuleMapper for Negative {
+            fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+                param.map(|tensor| tensor.neg())
+            }
+        }
+        // The gates of the condenser are -0.
+        let start = model(1).map(&mut Negative);
+        assert!(values(&start).iter().any(|value| value.to_bits() == (-0.0f32).to_bits()));
         assert_eq!(weights_hash(&interpolate(&start, start.clone(), 0.3)), weights_hash(&start));
     }
 }
