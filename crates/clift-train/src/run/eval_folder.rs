@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clift_eval::Summary;
 
 use crate::error::{TrainError, bad};
-use crate::events::Sink;
+use crate::events::{Event, Sink};
 use crate::run::lock::{LockedFolder, RunLock};
 
 /// The file that every evaluation writes.
@@ -51,16 +51,20 @@ impl EvalFolder {
     }
 }
 
-/// Reads the summary of an evaluation.
-pub(crate) fn read_summary(path: &Path) -> Result<Summary, TrainError> {
-    let text = std::fs::read(path).map_err(TrainError::io("reading the evaluation", path))?;
-    serde_json::from_slice(&text).map_err(TrainError::bad_file("evaluation", path))
+/// Reads the evaluation of a run that has no work left.
+pub(crate) fn read_finished(run_dir: &Path, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+    let run = run_dir.display();
+    sink.event(&Event::Message(format!(
+        "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
+    )));
+    let path = run_dir.join("eval").join(SUMMARY);
+    let text = std::fs::read(&path).map_err(TrainError::io("reading the evaluation", &path))?;
+    serde_json::from_slice(&text).map_err(TrainError::bad_file("evaluation", &path))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::events::Event;
 
     fn open(path: &Path, replace: bool) -> Result<EvalFolder, TrainError> {
         EvalFolder::open(path, replace, &mut |_: &Event| {})

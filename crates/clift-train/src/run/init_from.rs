@@ -1,12 +1,14 @@
-//! Initial weights of a stage from another model.
+//! Initial weights of a stage from another model, and weights between those and the trained ones.
 
 use std::path::Path;
 
+use burn::module::Module;
 use clift_model::{Clift, ModelPath, check_condenser, check_sizes, load_part, refuse_checkpoint};
 
-use crate::config::config::Config;
+use crate::config::config::{Config, Stage2Config};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
+use crate::stage::interpolation::interpolate;
 
 /// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
 /// the same stage of another run, from a model directory or from a weight file. Reports which parameters were loaded.
@@ -52,4 +54,27 @@ pub(crate) fn init_from(
         list(&loaded.unused)
     )));
     Ok(model)
+}
+
+/// Returns the weights at `stage2.weight_interpolation` of the way from the start of stage 2, which are those of stage 1 and
+/// of the initial condenser, to its end. `stage1` is called where the position is not the end.
+pub(crate) fn between(
+    config: &Config,
+    stage1: impl FnOnce() -> Result<Clift, TrainError>,
+    trained: Clift,
+    sink: &mut dyn Sink,
+) -> Result<Clift, TrainError> {
+    let Stage2Config { weight_interpolation: position, init_from: from, .. } = &config.stage2;
+    if *position == 1.0 {
+        return Ok(trained);
+    }
+    let mut start = init_from(stage1()?, config, Stage::Stage2, &mut |_: &Event| {})?.valid();
+    if from.is_none() {
+        // An untrained condenser returns the centroids unchanged, whatever its other weights are.
+        start.condenser = trained.condenser.clone().close_gates();
+    }
+    sink.event(&Event::Message(format!(
+        "stage2: saving the weights at {position} of the way from its start; checkpoints and validations have those at its end"
+    )));
+    Ok(interpolate(&start, trained, *position))
 }

@@ -11,7 +11,7 @@
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
-//! - `init_from`: initial weights of a stage
+//! - `init_from`: initial weights of a stage, and weights between those and the trained ones
 //! - `evaluate_model`: evaluate a model without a run; models of other runs
 //! - `run`: a run: open, train, evaluate
 

@@ -18,7 +18,7 @@ use clift_model::{
 use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_resume_log;
-use crate::config::config::{Config, Stage2Config};
+use crate::config::config::Config;
 use crate::distributed::machine::open_device;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
@@ -26,15 +26,14 @@ use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::fit_token_codec::ensure_codec;
 use crate::footprint::largest_tensor;
-use crate::run::eval_folder::{EvalFolder, SUMMARY, read_summary};
+use crate::run::eval_folder::{EvalFolder, SUMMARY, read_finished};
 use crate::run::evaluate_model::{open_lvsm, open_stage2};
-use crate::run::init_from::init_from;
+use crate::run::init_from::{between, init_from};
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
 use crate::run::training_data::TrainingData;
 use crate::run::validation::{EvalRequest, Validation};
-use crate::stage::interpolation::interpolate;
 use crate::stage::settings::StageSettings;
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
@@ -142,7 +141,7 @@ impl Run {
         let [has_stage1, has_stage2] = self.ranks.from_root(has_weights)?;
         let is_trained = has_stage1 && (has_stage2 || !stages.contains(&Stage::Stage2));
         if self.ranks.from_root(|| Ok(only.is_none() && is_trained && summary.exists()))? {
-            return self.finished(&summary, sink);
+            return self.ranks.is_root().then(|| read_finished(&self.config.run_dir, sink)).transpose();
         }
         if self.ranks.is_root() && !is_trained && summary.exists() {
             // Of former weights: of stage 1 alone, or before `--extend`.
@@ -187,18 +186,6 @@ impl Run {
         let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
         let summary = validation.evaluate(&self.models(sink)?, &request, &self.ranks, stop, sink)?;
         Ok(self.ranks.is_root().then_some(summary))
-    }
-
-    /// Reads the evaluation of a run without work, on rank 0.
-    fn finished(&self, summary: &Path, sink: &mut dyn Sink) -> Result<Option<Summary>, TrainError> {
-        if !self.ranks.is_root() {
-            return Ok(None);
-        }
-        let run = self.config.run_dir.display();
-        sink.event(&Event::Message(format!(
-            "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
-        )));
-        read_summary(summary).map(Some)
     }
 
     /// Evaluates the run. `beside` are other runs, evaluated on the same views: one with the same stage 1 whose stage 2 was
@@ -299,26 +286,10 @@ impl Run {
             Ok(Clift { condenser: initial.condenser, ..stage1 })
         };
         let trained = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?.valid();
-        self.ranks.from_root(|| Ok(save_weights(&self.interpolate(trained, sink)?, &self.weights(Stage::Stage2))?))
-    }
-
-    /// Returns the weights that stage 2 saves: `stage2.weight_interpolation` of the way from those it started from.
-    fn interpolate(&self, trained: Clift, sink: &mut dyn Sink) -> Result<Clift, TrainError> {
-        let Stage2Config { weight_interpolation: position, init_from: from, .. } = &self.config.stage2;
-        if *position == 1.0 {
-            return Ok(trained);
-        }
-        let condenser = if from.is_some() {
-            init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?.valid().condenser
-        } else {
-            // An untrained condenser returns the centroids unchanged, whatever its other weights are.
-            trained.condenser.clone().close_gates()
-        };
-        let start = Clift { condenser, ..self.load_stage1(None)?.valid() };
-        sink.event(&Event::Message(format!(
-            "stage2: saving the weights at {position} of the way from its start; checkpoints and validations have those at its end"
-        )));
-        Ok(interpolate(&start, trained, *position))
+        self.ranks.from_root(|| {
+            let model = between(&self.config, || self.load_stage1(None), trained, sink)?;
+            Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
+        })
     }
 
     fn parts(&self, stage: Stage) -> BatchParts {
