@@ -1,6 +1,6 @@
 //! A run: its directory, resumption, and the order of its stages.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
