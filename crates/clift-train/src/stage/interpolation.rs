@@ -77,7 +77,7 @@ mod tests {
         struct Negative;
         impl ModuleMapper for Negative {
             fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-                param.map(|tensor| tensor.neg())
+                param.map(Tensor::neg)
             }
         }
         // The gates of the condenser are -0.
