@@ -42,6 +42,7 @@ fn stage_2_saves_weights_between_its_start_and_its_end() {
                 let end = end.expect("the same parameters");
                 let start = start.unwrap_or(if name.contains(".gate.") { 0.0 } else { end });
                 let expected = start + 0.25 * (end - start);
+                // A few roundings in f32, of 6e-8 each.
                 assert!((value - expected).abs() <= 1e-6 * expected.abs().max(1e-3), "{name}: {value}, not {expected}");
             }
         }

@@ -58,7 +58,7 @@ pub(crate) fn init_from(
 
 /// Returns the weights at `stage2.weight_interpolation` of the way from the start of stage 2, which are those of stage 1 and
 /// of the initial condenser, to its end. `stage1` is called where the position is not the end.
-pub(crate) fn between(
+pub(crate) fn stage2_weights(
     config: &Config,
     stage1: impl FnOnce() -> Result<Clift, TrainError>,
     trained: Clift,

@@ -28,7 +28,7 @@ use crate::fit_token_codec::ensure_codec;
 use crate::footprint::largest_tensor;
 use crate::run::eval_folder::{EvalFolder, SUMMARY, read_finished};
 use crate::run::evaluate_model::{open_lvsm, open_stage2};
-use crate::run::init_from::{between, init_from};
+use crate::run::init_from::{init_from, stage2_weights};
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
@@ -287,7 +287,7 @@ impl Run {
         };
         let trained = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?.valid();
         self.ranks.from_root(|| {
-            let model = between(&self.config, || self.load_stage1(None), trained, sink)?;
+            let model = stage2_weights(&self.config, || self.load_stage1(None), trained, sink)?;
             Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
         })
     }
