@@ -63,9 +63,10 @@ const SMALL_DATA: &str = "data={source='auto', root='PATH', width=16, height=16,
 #[test]
 fn every_documented_command_runs() {
     let mut documents = sources(&["docs/guide"], &["md"]);
-    for name in ["README.md", "docs/reference/cli.md"] {
-        documents.insert(name.into(), std::fs::read_to_string(repository(name)).expect(name));
-    }
+    documents.insert("README.md".into(), std::fs::read_to_string(repository("README.md")).expect("README.md"));
+    let mut help = String::new();
+    add_help(&[], &mut help);
+    documents.insert("clift --help".into(), format!("```\n{help}```\n"));
     let place = Place::new();
     let base = place.at("base");
     prepare(&base);
@@ -102,6 +103,18 @@ fn every_documented_command_runs() {
     let expected =
         "codec compare completions data doctor encode eval export flops import metrics plan render train view";
     assert_eq!(names.into_iter().collect::<Vec<_>>().join(" "), expected, "commands with an example");
+}
+
+/// Appends the help texts of a command and its subcommands.
+fn add_help(command: &[String], help: &mut String) {
+    let output = finish(start(Command::new(BINARY).args(command).arg("--help").env("COLUMNS", "400"))).ok().stdout;
+    let listed = output.split("\nCommands:\n").nth(1).unwrap_or_default().lines().take_while(|line| !line.is_empty());
+    let names: Vec<String> =
+        listed.filter_map(|line| line.strip_prefix("  ")?.split(' ').next().map(Into::into)).collect();
+    for name in names.into_iter().filter(|name| !name.is_empty() && name != "help") {
+        add_help(&[command, &[name]].concat(), help);
+    }
+    help.push_str(&output);
 }
 
 /// The commands in the code blocks of a document, without optional arguments that are placeholders.

@@ -1,13 +1,12 @@
-//! Generates `docs/reference/cli.md` from the command tree and `docs/reference/config.md` from the doc comments and
-//! defaults of [`Config`]. `CLIFT_UPDATE=1 cargo test --release --workspace --lib reference` rewrites both pages.
+//! Checks the help texts, and generates `docs/reference/config.md` from the doc comments and defaults of [`Config`]:
+//! `CLIFT_UPDATE=1 cargo test --release --workspace --lib page_is_current` rewrites the page.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
 use std::path::Path;
 
-use clap::builder::StyledStr;
-use clap::{Arg, Command, CommandFactory};
+use clap::{Command, CommandFactory};
 use clift_train::Config;
 use toml::{Table, Value};
 
@@ -25,63 +24,22 @@ fn compare(path: &str, text: &str) {
     assert!(page == text, "{} is outdated; `CLIFT_UPDATE=1` rewrites the page", path.display());
 }
 
+/// Checks that the short help of every command and argument fits in a line of a terminal.
 #[test]
-fn cli_page_is_current() {
+fn short_help_fits_in_a_line() {
     let mut command = Args::command();
     command.build();
-    let mut page = "# Command line\n\nGenerated from `clift --help`.\n".to_owned();
-    add_command(&command, &mut page);
-    compare("docs/reference/cli.md", &page);
+    check_short_help(&command);
 }
 
-fn add_command(command: &Command, page: &mut String) {
-    let (name, about) = (command.get_bin_name().unwrap_or("clift"), command.get_long_about().or(command.get_about()));
-    let usage = command.clone().render_usage().to_string().replace("Usage: ", "");
-    write!(page, "\n## {name}\n\n{}\n\n```text\n{}\n```\n", text(about), usage.trim()).unwrap();
-    // Options of every command are listed once.
-    let is_root = command.get_bin_name().is_none_or(|name| name == "clift");
-    let is_listed =
-        |arg: &&Arg| !["help", "version"].contains(&arg.get_id().as_str()) && (is_root || !arg.is_global_set());
-    let arguments = command.get_arguments().filter(is_listed).map(|arg| (argument(arg), help(arg)));
-    let children: Vec<&Command> = command.get_subcommands().filter(|child| child.get_name() != "help").collect();
-    let commands = children.iter().map(|child| (child.get_bin_name().unwrap().to_owned(), text(child.get_about())));
-    for (i, (name, help)) in arguments.chain(commands).enumerate() {
+fn check_short_help(command: &Command) {
+    let arguments = command.get_arguments().map(|arg| (arg.get_id().as_str(), arg.get_help()));
+    for (name, help) in arguments.chain([(command.get_name(), command.get_about())]) {
+        let help = help.map(ToString::to_string).unwrap_or_default();
         let short = help.split(['[', '\n']).next().unwrap_or_default().trim();
         assert!(short.chars().count() <= 80 && !short.ends_with('.'), "{name}: {short}");
-        let head = if i == 0 { "\n| argument | |\n|---|---|\n" } else { "" };
-        writeln!(page, "{head}| `{name}` | {} |", cell(&help)).unwrap();
     }
-    if let Some(after) = command.get_after_help() {
-        write!(page, "\n```text\n{after}\n```\n").unwrap();
-    }
-    for child in children {
-        add_command(child, page);
-    }
-}
-
-fn text(text: Option<&StyledStr>) -> String {
-    text.map(ToString::to_string).unwrap_or_default()
-}
-
-/// Formats the flags and the value of an argument: `-o, --out <FILE>`.
-fn argument(arg: &Arg) -> String {
-    let short = arg.get_short().map(|short| format!("-{short}"));
-    let flags: Vec<String> = short.into_iter().chain(arg.get_long().map(|long| format!("--{long}"))).collect();
-    let names = arg.get_value_names().filter(|_| arg.get_action().takes_values()).unwrap_or_default();
-    let value = names.iter().map(|name| format!("<{name}>"));
-    [flags.join(", ")].into_iter().chain(value).collect::<Vec<_>>().join(" ").trim().to_owned()
-}
-
-fn help(arg: &Arg) -> String {
-    let mut help = text(arg.get_long_help().or(arg.get_help()));
-    if arg.get_action().takes_values() {
-        let values = |names: Vec<String>, label: &str| {
-            if names.is_empty() { String::new() } else { format!(" [{label}: {}]", names.join(", ")) }
-        };
-        help += &values(arg.get_default_values().iter().map(|value| value.display().to_string()).collect(), "default");
-        help += &values(arg.get_possible_values().iter().map(|value| value.get_name().into()).collect(), "values");
-    }
-    help
+    command.get_subcommands().for_each(check_short_help);
 }
 
 fn cell(text: &str) -> String {
