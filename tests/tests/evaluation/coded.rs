@@ -121,8 +121,8 @@ fn coded_scenes_have_the_patch_grids_of_the_model_now() {
     let config = place.at("run/config.toml");
     let text = std::fs::read_to_string(&config).unwrap();
     let set = |grids: &str| {
-        assert!(text.contains("[model]\n") && !text.contains("patch_grids"), "{text}");
-        std::fs::write(&config, text.replace("[model]\n", &format!("[model]\npatch_grids = {grids}\n"))).unwrap();
+        assert!(text.contains("patch_grids = 1\n"), "{text}");
+        std::fs::write(&config, text.replace("patch_grids = 1\n", &format!("patch_grids = {grids}\n"))).unwrap();
     };
     let grids = |file: &str| {
         place.clift(&format!("render DIR/{file} --path orbit --frames 2 --force -o DIR/out")).ok();

@@ -231,7 +231,7 @@ fn the_papers_counts_come_out_of_the_command() {
     place.clift("flops REPO/configs/tiny.toml --render 16,1.0 --json DIR/flops.json").ok();
     let counts = place.json("flops.json");
     assert_eq!((&counts["convention"], &counts["num_tokens"]), (&"macs".into(), &256.into()));
-    let rendered = list(&counts["rows"]).iter().filter(|row| row["case"] == "render");
+    let rendered = list(&counts["rows"]).iter().filter(|row| row["work"] == "render");
     assert_eq!(rendered.map(|row| &row["num_tokens"]).collect::<Vec<_>>(), [16, 256]);
     place.clift("flops --convention flop").fails_with(2, &["flop"]);
     place.clift("flops --render 5000").fails_with(2, &["a scene has 4096 tokens"]);
