@@ -32,7 +32,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-train",
         "clift-kernels clift-model clift-data clift-eval",
-        "error distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
+        "error version distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
     ),
     (
         "clift-bench",

@@ -160,7 +160,7 @@ fn codecs_survive_their_file_and_damage_is_found() {
     for (bytes, expected) in [
         (bytes[..bytes.len() - 1].to_vec(), "reading the token codec failed"),
         (text("clift-codec", "clift-scene"), "format \"clift-scene\", expected"),
-        (text("\"version\":\"2\"", "\"version\":\"3\""), "version \"3\", expected 1 or 2"),
+        (text("\"version\":\"2\"", "\"version\":\"3\""), "version 3, this clift reads version 2"),
         (text("\\\"dim\\\":8", "\\\"dim\\\":4"), "`mean` is F32 [8], expected F32 [4]"),
         (text("rate_psnr", "rate_psnt"), "no tensor `rate_psnr`"),
         (b"{}".to_vec(), "fit it again with `clift codec`"),
