@@ -128,7 +128,7 @@ def worker(arguments: str) -> None:
 
 
 def ours(clift: Path, folder: Path, args: argparse.Namespace, out: Path) -> dict[str, Any]:
-    command = [str(clift), "bench", "data", str(folder), "--json", str(out), "--clips", str(args.clips)]
+    command = [str(clift), "bench", "data", str(folder), "--json", str(out), "--force", "--clips", str(args.clips)]
     command += ["--size", args.size, "--threads", str(NUM_WORKERS)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return json.loads(out.read_text())

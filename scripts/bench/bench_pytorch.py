@@ -118,7 +118,7 @@ class Bench:
         size |= {"contexts": side.contexts} if side.contexts else {}
         for override in [*overrides(size, side.is_lvsm), *side.overrides]:
             command += ["--set", override]
-        command += ["--set", f"seed={round_}", "--json", str(self.folder / "ours.json")]
+        command += ["--set", f"seed={round_}", "--json", str(self.folder / "ours.json"), "--force"]
         if side.work == "kmeans":
             command += ["--features", str(self.features_file())]
         return command

@@ -104,7 +104,7 @@ class Bench:
 
     def measure_clift(self, row: Row, precision: str) -> list[float]:
         command = self.clift("bench", str(self.args.config), "--case", row.work, "--no-error", "--storage", "1/4")
-        command += ["--repeats", str(self.args.repeats), "--warmup", str(self.args.warmup), "--json", str(self.json)]
+        command += ["--repeats", str(self.args.repeats), "--warmup", str(self.args.warmup), "--json", str(self.json), "--force"]
         command += ["--set", f'precision="{precision}"']
         command += ["--render", str(row.render_tokens)] if row.render_tokens else []
         run(command, self.args.limit)
@@ -116,7 +116,7 @@ class Bench:
     def precision(self) -> list[dict[str, Any]] | str:
         """What f16 products change, from `clift bench precision`."""
         command = self.clift("bench", "precision", str(self.args.config))
-        command += ["--repeats", str(self.args.repeats), "--warmup", str(self.args.warmup), "--json", str(self.json)]
+        command += ["--repeats", str(self.args.repeats), "--warmup", str(self.args.warmup), "--json", str(self.json), "--force"]
         try:
             run(command, self.args.limit)
         except Failed as error:

@@ -20,7 +20,7 @@ from pathlib import Path
 def plan(clift: str, arguments: list[str], folder: Path) -> dict[str, dict]:
     """The parts of a plan by name."""
     path = folder / "plan.json"
-    subprocess.run([clift, "plan", *arguments, "--json", path], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([clift, "plan", *arguments, "--json", path, "--force"], check=True, stdout=subprocess.DEVNULL)
     return {part["part"]: part for part in json.loads(path.read_text())["parts"]}
 
 

@@ -43,7 +43,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift",
         "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
-        "output interrupt exit_code threads commands cli reference_pages",
+        "interrupt exit_code output threads commands cli reference_pages",
     ),
 ];
 

@@ -157,13 +157,14 @@ fn smaller(line: &str) -> String {
 
 /// Removes what an earlier example wrote where this one writes. Evaluations of runs stay: a user has them, too.
 fn make_room(folder: &Path, args: &[String]) {
-    let flag = args.iter().position(|arg| arg == "-o" || arg == "--out").and_then(|at| args.get(at + 1));
+    let is_output = |flag: &str| ["-o", "--out", "--json", "--csv", "--images"].contains(&flag);
+    let flags = args.windows(2).filter(|pair| is_output(&pair[0])).map(|pair| &pair[1]);
     let positional = match [args[0].as_str(), args.get(1).map_or("", String::as_str)] {
         ["data", "synth"] => args.get(2),
         ["data", "convert"] => args.get(3),
         _ => None,
     };
-    for path in flag.into_iter().chain(positional) {
+    for path in flags.chain(positional) {
         let path = folder.join(path);
         drop(if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) });
     }

@@ -1,6 +1,6 @@
 //! Checking, indexing, converting and timing data.
 
-use crate::support::{Place, list, number};
+use crate::support::{Place, finish, list, number, signal, wait_until};
 
 /// A folder with two rooms, whose textures are fine enough for corners.
 fn with_rooms() -> Place {
@@ -27,6 +27,9 @@ fn scenes_are_checked_converted_and_checked_again() {
     convert().prints("2 scenes of 2; 18 frames written, 18 copied and 0 encoded");
     convert().prints("2 scenes of 2, 2 of them already complete; 0 frames written");
     place.clift("data check DIR/packed").ok();
+    place.clift(check).fails_with(2, &["check.json exists; replace it with --force"]);
+    place.clift(&check.replace("check.json", "new.json")).fails_with(2, &["png exists; replace it with --force"]);
+    place.clift(&format!("{check} --force")).ok();
 
     // A truncated scene is flagged; converting again rewrites it.
     place.truncate(&format!("packed/test/{key}.torch"));
@@ -37,6 +40,19 @@ fn scenes_are_checked_converted_and_checked_again() {
 }
 
 #[test]
+fn an_interrupted_synth_leaves_no_split() {
+    let place = Place::new();
+    let synth = "data synth DIR/rooms --frames 4 --size 16x16";
+    let mut child = place.start(&format!("{synth} --scenes 100000"));
+    wait_until(&mut child, "the folder", || place.at("rooms").read_dir().is_ok_and(|mut items| items.next().is_some()));
+    signal(&child, "-INT");
+    finish(child);
+    assert_eq!(place.names("rooms"), [".clift-train"]);
+    place.clift(&format!("{synth} --scenes 1")).ok();
+    assert_eq!(place.names("rooms"), ["evaluation_index.json", "test", "train"]);
+}
+
+#[test]
 fn indices_hold_overlapping_views_and_are_not_overwritten() {
     let place = with_rooms();
     let index = "data index DIR/rooms -o DIR/index.json";
@@ -44,7 +60,7 @@ fn indices_hold_overlapping_views_and_are_not_overwritten() {
     for entry in place.json("index.json").as_object().unwrap().values() {
         assert_eq!((list(&entry["context"]).len(), list(&entry["target"]).len()), (4, 1));
     }
-    place.clift(index).fails_with(2, &["exists; remove it"]);
+    place.clift(index).fails_with(2, &["index.json exists; replace it with --force"]);
     let ran = place.clift("data index DIR/rooms -o DIR/other.json");
     ran.fails_with(1, &["no scene has overlapping views 45 to 135 frames apart"]);
 }

@@ -51,7 +51,7 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
             (found["scene_values"].as_u64(), found["num_render_tokens"].as_u64()),
             (Some(16 * count as u64), Some(count as u64))
         );
-        place.clift(&format!("flops DIR/{name}/config.toml --convention macs --json DIR/flops.json")).ok();
+        place.clift(&format!("flops DIR/{name}/config.toml --convention macs --json DIR/flops.json --force")).ok();
         let flops = place.json("flops.json");
         assert_eq!(number(found, "gflops"), number(&list(&flops["rows"])[0], "giga"));
         assert_eq!(list(&flops["rows"]).len(), 2, "render and encode");

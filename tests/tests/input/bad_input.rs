@@ -258,7 +258,8 @@ fn damaged_checkpoints_are_errors_and_change_nothing() {
             }
             let before = files(&run.join("stage1"));
             let damaged = run.join(newest).join(file).display().to_string();
-            let fix = "the newest checkpoint is damaged: remove step-000000006 to resume from step-000000004";
+            let fix =
+                "the newest checkpoint is damaged: move step-000000006 to another folder to resume from step-000000004";
             place.train("run --only stage1", &[]).fails_naming(1, &[&damaged], fix);
             assert!(files(&run.join("stage1")) == before, "{file}: a checkpoint was changed");
             assert_eq!(place.metrics("run"), place.metrics("whole"), "{file}: a step was made or forgotten");
@@ -300,4 +301,37 @@ fn scenes_that_become_too_short_are_refused_before_training() {
     let expected = "0 of 8 scenes used; 8 shorter than the 9 frames that data.views.min_gap needs";
     place.train("run", &[views, "stage1.steps=6"]).fails_with(1, &[expected]);
     assert!(!place.at("run/stage1").exists());
+}
+
+#[test]
+fn outputs_replace_neither_inputs_nor_other_files() {
+    let place = Place::with(&WHOLE);
+    place.write("mine.json", "mine");
+    std::fs::copy(repository("tests/micro.toml"), place.at("micro.toml")).unwrap();
+    place.clift("data synth DIR/rooms --scenes 1 --frames 9 --size 16x16 --split test").ok();
+    place.clift("data convert DIR/rooms DIR/scenes --to scenes").ok();
+    copy_folder(&repository("data-fixtures/layouts/capture/attic"), &place.at("0048"));
+    place.write("0048/images/0048.png", "a photo");
+    let before = files(&place.at(""));
+    let images = "data check DIR/0048 --images DIR/0048/images --force";
+    place.clift(images).fails_with(2, &["0048.png exists and belongs to the input "]);
+    for (command, input) in [
+        ("plan DIR/micro.toml --json", "micro.toml"),
+        ("flops DIR/micro.toml --json", "micro.toml"),
+        ("bench DIR/micro.toml --json", "micro.toml"),
+        ("bench precision DIR/micro.toml --json", "micro.toml"),
+        ("bench data DIR/rooms --json", "rooms/test/index.json"),
+        ("compare DIR/run DIR/run/eval --json", "run/eval/views.csv"),
+        ("data info DIR/rooms/evaluation_index.json --json", "rooms/evaluation_index.json"),
+        ("data check DIR/scenes --json", "scenes/test/SHA256SUMS"),
+        ("data index DIR/rooms -o", "rooms/test/000000.torch"),
+        ("metrics DIR/run --csv", "run/metrics.jsonl"),
+        ("encode DIR/run --scene synthetic-0-test-00000 -o DIR/new.clift --save-clusters", "run/run.json"),
+    ] {
+        place.clift(&format!("{command} DIR/mine.json")).fails_with(2, &["mine.json exists; replace it with --force"]);
+        place
+            .clift(&format!("{command} DIR/{input} --force"))
+            .fails_with(2, &[input, " exists and belongs to the input "]);
+    }
+    assert!(files(&place.at("")) == before, "a file changed");
 }

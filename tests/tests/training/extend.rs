@@ -1,6 +1,8 @@
 //! `--extend`: more steps than at the start of the run.
 
-use crate::support::{Place, WHOLE, files, number};
+use std::process::Command;
+
+use crate::support::{BINARY, Place, WHOLE, files, finish, number, start};
 
 #[test]
 fn extended_stages_follow_the_longer_schedule() {
@@ -28,6 +30,18 @@ fn extended_stages_follow_the_longer_schedule() {
     assert_eq!(place.json("run/run.json")["extended"], expected);
     // Counts do not shrink.
     place.train("run --extend", &[]).fails_with(2, &["stage2.steps: 8 -> 4"]);
+}
+
+/// A limit on file sizes stops a write as a full disk does, without the right to mount one.
+#[test]
+fn a_full_disk_leaves_the_weights_where_they_are() {
+    let place = Place::with(&WHOLE);
+    let before = files(&place.at("run"));
+    let mut command = Command::new("sh");
+    command.args(["-c", "trap '' XFSZ; ulimit -f 0; exec \"$@\"", "sh", BINARY]);
+    let args = place.train_args("run --extend", &["stage2.steps=8"]);
+    finish(start(command.args(args))).fails_with(1, &["File too large"]);
+    assert!(files(&place.at("run")) == before, "a file changed");
 }
 
 #[test]

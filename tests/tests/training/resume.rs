@@ -73,6 +73,20 @@ fn fresh_moves_the_former_run_aside() {
 }
 
 #[test]
+fn folders_that_are_not_runs_are_refused() {
+    let place = Place::new();
+    place.write("letters/letter.txt", "mine");
+    let refused = "the folder has files and is not a run (it has no run.json)";
+    for flags in ["", " --fresh", " --only stage1"] {
+        place.train(&format!("letters{flags}"), &[]).fails_with(2, &[refused]);
+    }
+    assert_eq!(place.names(""), ["letters"], "nothing is renamed");
+    assert_eq!(place.names("letters"), ["letter.txt"], "no lock stays");
+    std::fs::create_dir(place.at("empty")).expect("writable");
+    place.train("empty --only stage1 --fresh", &[]).ok();
+}
+
+#[test]
 fn an_evaluation_can_be_interrupted() {
     let place = Place::new();
     place.train("run", &["data.synthetic.num_scenes=2000"]).ok();

@@ -32,6 +32,28 @@ fn the_command_line_says_so_and_starts_nothing() {
 }
 
 #[test]
+fn cpu_runs_resume_and_load_no_driver() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = folder.path().join("run");
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("micro.toml");
+    let train = |program: &str, words: &[&str]| {
+        let mut command = Command::new(program);
+        command.args(words).arg(&config).args(["--set", &format!("run_dir={:?}", run.display().to_string())]);
+        command.env("LD_DEBUG", "files");
+        without_adapter(&mut command)
+    };
+    // Killed in the middle of stage 1, after a checkpoint.
+    let (code, text) = train(env!("CARGO_BIN_EXE_clift-killed"), &["saved/stage1/2", "train"]);
+    assert_eq!(code, None, "{text}");
+    let (code, text) = train(env!("CARGO_BIN_EXE_clift-under-test"), &["train"]);
+    assert_eq!(code, Some(0), "{text}");
+    assert!(text.contains("stage1: resumed after 2 of 6 steps") && !text.contains("panicked"), "{text}");
+    let drivers: Vec<&str> =
+        text.lines().filter(|line| line.contains("libvulkan") || line.contains("libEGL")).collect();
+    assert!(text.contains("libc.so") && drivers.is_empty(), "{drivers:?}");
+}
+
+#[test]
 fn the_suite_passes_by_unless_it_is_required() {
     let this = || {
         let mut command = Command::new(std::env::current_exe().expect("the path of this test"));

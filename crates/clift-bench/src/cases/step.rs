@@ -45,7 +45,7 @@ impl StepCase {
 pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
     TrainState {
         model: freeze(stage, context.model()),
-        optimizer: StageOptimizer::new(context.config.stage(stage).optimizer),
+        optimizer: StageOptimizer::new(context.config.stage(stage).optimizer, &context.device),
         device: context.device.clone().autodiff(),
         loss: Loss::default(),
         activation_checkpointing: context.config.activation_checkpointing,

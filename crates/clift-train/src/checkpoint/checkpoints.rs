@@ -18,6 +18,7 @@ use crate::step::train_state::TrainState;
 const MODEL: &str = "model.bpk";
 const OPTIMIZER: &str = "optimizer.bpk";
 const SAVING: &str = "writing a checkpoint";
+const LOADING: &str = "loading a checkpoint";
 
 /// The checkpoints of one stage.
 #[derive(Clone, Debug)]
@@ -110,10 +111,12 @@ impl Checkpoints {
     /// Loads the checkpoint of a step into `train_state`, and changes no file.
     ///
     /// # Errors
-    /// [`TrainError::Damaged`] for a damaged checkpoint, [`TrainError::BadConfig`] for one of another network,
-    /// [`TrainError::Io`] for files that cannot be read.
+    /// [`TrainError::Damaged`] for a file that is missing or has another length or checksum, [`TrainError::BadConfig`] for a
+    /// checkpoint of another network, [`TrainError::BadFile`] for contents that cannot be used, [`TrainError::Io`] for files
+    /// that cannot be read, and if Burn panics.
     pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<Progress, TrainError> {
-        load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
+        let path = self.path_of(step);
+        let state = verify(&path).map_err(|source| {
             let is_damage = match &source {
                 TrainError::BadFile { .. } => true,
                 TrainError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
@@ -122,13 +125,14 @@ impl Checkpoints {
             if !is_damage {
                 return source;
             }
-            let older = self.steps().unwrap_or_default().into_iter().rfind(|older| *older < step);
-            let fix = match older {
-                Some(older) => format!("remove {} to resume from {}", name_of(step), name_of(older)),
-                None => "the stage has no other; start a new run with --fresh".into(),
+            let is_whole = |older: &u64| *older < step && verify(&self.path_of(*older)).is_ok();
+            let fix = match self.steps().unwrap_or_default().into_iter().rfind(is_whole) {
+                Some(older) => format!("move {} to another folder to resume from {}", name_of(step), name_of(older)),
+                None => "the stage has no whole one; start a new run with --fresh, which keeps this one".into(),
             };
             TrainError::Damaged { source: Box::new(source), fix }
-        })
+        })?;
+        apply(state, &path, self.model.as_ref(), train_state)
     }
 
     /// Returns the path of the newest checkpoint.
@@ -209,34 +213,44 @@ fn remove_if_present(folder: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
-fn load_checkpoint(
+fn bad(folder: &Path, name: &str, reason: String) -> TrainError {
+    TrainError::bad_file("checkpoint", &folder.join(name))(reason)
+}
+
+/// Reads the state of a checkpoint and compares the lengths and checksums of its files.
+fn verify(folder: &Path) -> Result<State, TrainError> {
+    let state = State::read(folder)?;
+    if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !state.files.contains_key(*name)) {
+        return Err(bad(folder, STATE, format!("the checksum of {name} is missing")));
+    }
+    for (name, expected) in &state.files {
+        let file = folder.join(name);
+        let found = Fingerprint::of(&file).map_err(TrainError::io(LOADING, &file))?;
+        if found != *expected {
+            let reason = format!("{} bytes with other contents, {} expected", found.num_bytes, expected.num_bytes);
+            return Err(bad(folder, name, reason));
+        }
+    }
+    Ok(state)
+}
+
+/// Loads a verified checkpoint into `train_state`.
+fn apply(
+    state: State,
     folder: &Path,
     expected: Option<&ModelConfig>,
     train_state: &mut TrainState,
 ) -> Result<Progress, TrainError> {
-    let bad = |name: &str, reason: String| TrainError::bad_file("checkpoint", &folder.join(name))(reason);
-    let State { progress, files, model, loss_scale, .. } = State::read(folder)?;
-    if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
-        return Err(bad(STATE, format!("the checksum of {name} is missing")));
-    }
+    let bad = |name: &str, reason: String| bad(folder, name, reason);
+    let State { progress, model, loss_scale, .. } = state;
     if let (Some(model), Some(expected)) = (&model, expected)
         && *expected != (ModelConfig { patch_grids: expected.patch_grids, ..model.clone() })
     {
         let value = format!("{expected:?}");
         return Err(crate::error::bad("model", value, &format!("{} is of the network {model:?}", folder.display())));
     }
-    for (name, expected) in &files {
-        let file = folder.join(name);
-        let found = Fingerprint::of(&file).map_err(TrainError::io("reading a checkpoint", &file))?;
-        if found != *expected {
-            let reason = format!("{} bytes with other contents, {} expected", found.num_bytes, expected.num_bytes);
-            return Err(bad(name, reason));
-        }
-    }
     let record = ModuleRecord::load(folder.join(MODEL)).map_err(|error| bad(MODEL, error.to_string()))?;
-    // Burn 0.22 panics for integer tensors and for optimizer tensors without parameter ids, and ignores unknown tensors.
-    let loaded = catch_unwind(AssertUnwindSafe(|| train_state.model.clone().try_load_record(record)));
-    let loaded = loaded.map_err(|_| bad(MODEL, "a tensor is not of a float type".into()))?;
+    let loaded = caught(&folder.join(MODEL), || train_state.model.clone().try_load_record(record))?;
     let loaded = loaded.map_err(|error| bad(MODEL, format!("{error:?}")))?;
     if let Some((name, dtype)) = first_not_f32(&loaded) {
         return Err(bad(MODEL, format!("{name} is {dtype:?}, not F32")));
@@ -244,10 +258,12 @@ fn load_checkpoint(
     train_state.model = loaded;
     let record = OptimizerRecord::load(folder.join(OPTIMIZER)).map_err(|error| bad(OPTIMIZER, error.to_string()))?;
     let num_tensors = record.len();
-    let loaded = catch_unwind(AssertUnwindSafe(|| train_state.optimizer.clone().load_record(record)));
-    let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
-    let foreign = || bad(OPTIMIZER, "the file is no record of this optimizer".into());
-    train_state.optimizer = whole.ok_or_else(foreign)?;
+    let loaded = caught(&folder.join(OPTIMIZER), || train_state.optimizer.clone().load_record(record))?;
+    if loaded.to_record().len() != num_tensors {
+        // Burn ignores unknown tensors.
+        return Err(bad(OPTIMIZER, "the file is not a record of this optimizer".into()));
+    }
+    train_state.optimizer = loaded;
     if loss_scale.is_some_and(|scale| !scale.is_possible()) {
         return Err(bad(STATE, "the loss scale is no power of two from 1 to 2^32".into()));
     }
@@ -256,6 +272,16 @@ fn load_checkpoint(
         train_state.loss_scale = loss_scale;
     }
     Ok(progress)
+}
+
+/// Returns a panic of `load` as an error. Burn 0.22 panics for integer tensors, for optimizer tensors without parameter ids,
+/// and if a device fails: a panic does not show that the file is damaged.
+fn caught<T>(file: &Path, load: impl FnOnce() -> T) -> Result<T, TrainError> {
+    catch_unwind(AssertUnwindSafe(load)).map_err(|panic| {
+        let text = panic.downcast_ref::<&str>().map(ToString::to_string);
+        let text = text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
+        TrainError::io(LOADING, file)(std::io::Error::other(format!("Burn panicked: {text}")))
+    })
 }
 
 #[cfg(test)]
@@ -288,8 +314,8 @@ mod tests {
         // Weights of the model in the file of the optimizer, with a matching checksum.
         std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).unwrap();
         update_checksum(&step, OPTIMIZER);
-        let refused = checkpoints.resume(&mut train_state);
-        assert!(refused.is_err(), "{refused:?}");
+        let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
+        assert!(!message.contains("damaged"), "{message}");
 
         let mut state = State::read(&step).unwrap();
         state.files.remove(MODEL);
@@ -306,6 +332,13 @@ mod tests {
     }
 
     #[test]
+    fn a_panic_is_not_called_damage() {
+        let error = caught(Path::new(OPTIMIZER), || panic!("no adapter")).map(|(): ()| ()).unwrap_err();
+        assert!(matches!(error, TrainError::Io { .. }), "{error}");
+        assert!(error.to_string().ends_with("failed: Burn panicked: no adapter: optimizer.bpk"), "{error}");
+    }
+
+    #[test]
     fn weights_of_other_types_are_refused() {
         let place = tempfile::tempdir().unwrap();
         let (mut train_state, checkpoints, step) = saved(place.path());
@@ -317,7 +350,7 @@ mod tests {
         std::fs::write(&path, bytes).unwrap();
         update_checksum(&step, MODEL);
         let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
-        assert!(message.contains("a tensor is not of a float type"), "{message}");
+        assert!(message.contains("loading a checkpoint failed: Burn panicked: "), "{message}");
 
         let wide = train_state.model.valid().map(&mut ToF64);
         wide.into_record().save(&path).unwrap();

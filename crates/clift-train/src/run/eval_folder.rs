@@ -6,10 +6,13 @@ use clift_eval::Summary;
 
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
-use crate::run::lock::{LockedFolder, RunLock};
+use crate::run::lock::{LOCK, LockedFolder, RunLock, has_other_files};
 
 /// The file that every evaluation writes.
 pub(crate) const SUMMARY: &str = "summary.json";
+
+/// Files that are replaced on request only.
+const RESULTS: [&str; 4] = [SUMMARY, "scenes.csv", "views.csv", "report.html"];
 
 /// An output folder, locked until it is dropped: no other process evaluates into it.
 #[derive(Debug)]
@@ -19,18 +22,24 @@ pub struct EvalFolder {
 }
 
 impl EvalFolder {
-    /// Makes and locks a folder. A folder with an evaluation is refused, unless `replace` is set.
+    /// Makes and locks a folder. A folder with results is refused unless `replace` is set, one with files of something other
+    /// than an evaluation always. A refused folder is not changed.
     ///
     /// # Errors
-    /// [`TrainError::BadConfig`] for an existing evaluation, [`TrainError::Locked`] if another process evaluates into the
+    /// [`TrainError::BadConfig`] for a refused folder, [`TrainError::Locked`] if another process evaluates into the
     /// folder, [`TrainError::Io`].
     pub fn open(path: &Path, replace: bool, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+        let has = |name: &str| path.join(name).exists();
+        let refuse = |fix: &str| Err(bad("--out", path.display(), fix));
+        let is_evaluation = has(SUMMARY) || (has(LOCK) && !has("run.json"));
+        if !is_evaluation && has_other_files(path)? {
+            return refuse("the folder has files and is not an evaluation; set another --out");
+        }
+        if !replace && RESULTS.into_iter().any(has) {
+            return refuse("the folder holds an evaluation; replace it with --force, or set another --out");
+        }
         std::fs::create_dir_all(path).map_err(TrainError::io("making a folder", path))?;
         let lock = RunLock::take(path, LockedFolder::Evaluation, sink)?;
-        if !replace && path.join(SUMMARY).exists() {
-            let fix = "the folder holds an evaluation; replace it with --force, or set another --out";
-            return Err(bad("--out", path.display(), fix));
-        }
         Ok(Self { path: path.into(), _lock: Some(lock) })
     }
 
@@ -79,6 +88,27 @@ mod tests {
         let message = open(&out, false).unwrap_err().to_string();
         assert!(message.contains("`--out` = ") && message.contains("--force"), "{message}");
         open(&out, true).unwrap();
+        // An unfinished evaluation, and one whose summary was removed.
+        std::fs::remove_file(out.join(SUMMARY)).unwrap();
+        drop(open(&out, false).unwrap());
+        std::fs::write(out.join("views.csv"), "").unwrap();
+        assert!(open(&out, false).unwrap_err().to_string().contains("--force"));
+        open(&out, true).unwrap();
+    }
+
+    #[test]
+    fn folders_of_other_files_are_refused_unchanged() {
+        let place = tempfile::tempdir().unwrap();
+        for (name, file) in [("table", "views.csv"), ("letters", "letter.txt"), ("run", "run.json")] {
+            let folder = place.path().join(name);
+            std::fs::create_dir(&folder).unwrap();
+            std::fs::write(folder.join(file), "mine").unwrap();
+            for replace in [false, true] {
+                let message = open(&folder, replace).unwrap_err().to_string();
+                assert!(message.contains("is not an evaluation; set another --out"), "{message}");
+            }
+            assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1, "no lock stays in {name}");
+        }
     }
 
     #[test]

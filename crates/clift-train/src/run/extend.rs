@@ -35,9 +35,11 @@ pub(crate) struct ExtensionRecord {
 }
 
 impl StepExtension {
-    /// Prepares the stage of the run of `config`, which has the new number, for more steps. Weights of a finished stage are
-    /// renamed.
-    pub fn apply(self, config: &Config, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
+    /// Checks that the stage of the run of `config`, which has the new number, can be extended. Changes no file.
+    ///
+    /// # Errors
+    /// [`TrainError::BadConfig`] if it cannot, [`TrainError::Io`].
+    pub fn check(self, config: &Config) -> Result<ExtensionRecord, TrainError> {
         let Self { stage, from, to } = self;
         let folder = &config.run_dir;
         let refuse = |fix: &str| bad("--extend", format!("{}.steps {from} -> {to}", stage.name()), fix);
@@ -62,13 +64,25 @@ impl StepExtension {
                 return Err(refuse(&fix));
             }
         }
+        if newest.is_none() && own.join("model.safetensors").exists() {
+            let fix = format!("the stage has no checkpoint to resume from in {}/checkpoints", stage.name());
+            return Err(refuse(&fix));
+        }
+        Ok(ExtensionRecord { stage, from, to, at_step })
+    }
+}
+
+impl ExtensionRecord {
+    /// Renames the weights of a finished stage. To be called before the new number of steps is in the run directory: a process
+    /// killed in between makes these weights again.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`].
+    pub fn keep_weights(self, config: &Config, sink: &mut dyn Sink) -> Result<(), TrainError> {
+        let Self { stage, from, to, at_step } = self;
+        let own = config.run_dir.join(stage.name());
         let weights = own.join("model.safetensors");
         if weights.exists() {
-            if newest.is_none() {
-                let fix = format!("the stage has no checkpoint to resume from in {}/checkpoints", stage.name());
-                return Err(refuse(&fix));
-            }
-            // Before the new number is written: a process killed in between makes these weights again.
             let kept = own.join(format!("model-{from}-steps.safetensors"));
             let codecs = [weights.as_path(), &kept].map(TokenCodec::path_of);
             if codecs[0].exists() {
@@ -82,6 +96,6 @@ impl StepExtension {
             "{} is extended from {from} to {to} steps: the steps after {at_step} use the learning rates of {to} steps",
             stage.name()
         )));
-        Ok(ExtensionRecord { stage, from, to, at_step })
+        Ok(())
     }
 }

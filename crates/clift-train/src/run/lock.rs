@@ -1,8 +1,10 @@
 //! One process per run directory, and per output folder of an evaluation.
 
 use std::fs::{File, TryLockError};
-use std::io::{Read, Seek, Write};
+use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::Path;
+
+use clift_data::TEMPORARY;
 
 use crate::error::TrainError;
 use crate::events::{Event, Sink};
@@ -29,6 +31,24 @@ impl LockedFolder {
     }
 }
 
+/// Name of the lock in its folder.
+pub(crate) const LOCK: &str = "lock";
+
+/// Whether a folder has files besides a lock and the temporary files of killed processes. A missing folder, and a
+/// path that is not a folder, have none.
+///
+/// # Errors
+/// [`TrainError::Io`] for a folder that cannot be read.
+pub(crate) fn has_other_files(folder: &Path) -> Result<bool, TrainError> {
+    let items = match std::fs::read_dir(folder) {
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(false),
+        items => items.and_then(Iterator::collect::<Result<Vec<_>, _>>),
+    };
+    let items = items.map_err(TrainError::io("reading the folder", folder))?;
+    let is_other = |name: &str| name != LOCK && !name.starts_with(TEMPORARY);
+    Ok(items.iter().any(|item| is_other(&item.file_name().to_string_lossy())))
+}
+
 /// Lock of a folder. The operating system releases the lock when the process ends; a remaining file `lock` has no
 /// effect.
 #[derive(Debug)]
@@ -49,7 +69,7 @@ impl RunLock {
     /// # Errors
     /// [`TrainError::Locked`] if another process has the lock, [`TrainError::Io`] if the file cannot be opened.
     pub fn take(folder: &Path, kind: LockedFolder, sink: &mut dyn Sink) -> Result<Self, TrainError> {
-        let path = folder.join("lock");
+        let path = folder.join(LOCK);
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
         let mut file = opened.map_err(TrainError::io("opening the lock of the folder", &path))?;
         match file.try_lock() {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clift_data::{make_folder, remove_leftovers, replace_file};
+use clift_data::{StagedDir, make_folder, remove_leftovers, replace_file};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -11,7 +11,7 @@ use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::run::extend::{ExtensionRecord, StepExtension};
-use crate::run::lock::{LockedFolder, RunLock};
+use crate::run::lock::{LockedFolder, RunLock, has_other_files};
 use crate::version::check_version;
 
 const FILE: &str = "run.json";
@@ -83,13 +83,19 @@ const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
 /// Locks the run directory of a config, new or existing, and writes the resolved config to it. Returns the lock.
 ///
 /// # Errors
-/// [`TrainError::OtherRun`], [`TrainError::Locked`] and [`TrainError::Io`].
+/// [`TrainError::BadConfig`] for a folder with files that is not a run, [`TrainError::OtherRun`], [`TrainError::Locked`] and
+/// [`TrainError::Io`].
 pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<RunLock, TrainError> {
     let folder = &config.run_dir;
     if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
         return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
     }
-    if options.fresh && folder.exists() {
+    let is_run = folder.join(FILE).exists();
+    if !is_run && has_other_files(folder)? {
+        let fix = "the folder has files and is not a run (it has no run.json); write the path of a new folder";
+        return Err(bad("run_dir", folder.display(), fix));
+    }
+    if options.fresh && is_run {
         // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
         drop(RunLock::take(folder, LockedFolder::Run, sink)?);
         let moved = free_name(folder);
@@ -101,7 +107,7 @@ pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn 
     remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
     // A run that failed before its first stage may get other settings.
     let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
-    let mut file = RunFile::new(options.overfit);
+    let (mut file, mut extended) = (RunFile::new(options.overfit), Vec::<ExtensionRecord>::new());
     let written = folder.join("config.toml");
     if has_begun && !written.exists() {
         let reason = "missing from a run that has begun; restore the file, or start a new run with --fresh";
@@ -111,12 +117,18 @@ pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn 
         let found = RunFile::read(folder)?;
         let extensions = compare_settings(folder, &found, config, options.overfit, options.extend)?;
         file.extended = found.extended;
-        for extension in extensions {
-            file.extended.push(extension.apply(config, sink)?);
-        }
+        extended = extensions.into_iter().map(|extension| extension.check(config)).collect::<Result<_, _>>()?;
+        file.extended.extend(&extended);
     }
-    file.write(folder)?;
-    write_config(config)?;
+    // Both files are on the disk before weights are renamed: a full disk changes nothing.
+    let writing = "writing the settings of the run";
+    let staged = StagedDir::new(folder).map_err(TrainError::io(writing, folder))?;
+    file.write(staged.path())?;
+    write_config(config, staged.path())?;
+    for extension in extended {
+        extension.keep_weights(config, sink)?;
+    }
+    staged.commit().map_err(TrainError::io(writing, folder))?;
     Ok(lock)
 }
 
@@ -128,9 +140,9 @@ pub(crate) fn require_run(folder: &Path) -> Result<(), TrainError> {
     if folder.join(FILE).exists() { Ok(()) } else { Err(TrainError::Moved { path: folder.into() }) }
 }
 
-/// Writes every key of a config to its run directory.
-fn write_config(config: &Config) -> Result<(), TrainError> {
-    let path = config.run_dir.join("config.toml");
+/// Writes every key of a config to `config.toml` in a folder.
+fn write_config(config: &Config, folder: &Path) -> Result<(), TrainError> {
+    let path = folder.join("config.toml");
     let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &path))?;
     replace_file(&path, text.as_bytes()).map_err(TrainError::io("writing the config", &path))
 }

@@ -2,8 +2,12 @@
 
 use burn::module::{Module, ModuleVisitor, Param, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer, OptimizerRecord};
-use burn::tensor::Tensor;
+use burn::optim::{
+    AdamWConfig, DynOptimizer, DynState, GradientsParams, LearningRate, ModuleOptimizer, OptimizerRecord, StateSink,
+    StateSource,
+};
+use burn::tensor::kind::BridgeTensor;
+use burn::tensor::{Device, Tensor};
 
 use crate::config::config::{Algorithm, OptimizerConfig};
 use crate::step::muon::Muon;
@@ -20,21 +24,24 @@ pub struct StageOptimizer {
 }
 
 impl StageOptimizer {
-    /// Makes the optimizer of a config, without state.
+    /// Makes the optimizer of a config, without state. Loaded state is placed on `device`.
     ///
     /// # Panics
     /// Never: the pattern of the paths is valid.
-    pub fn new(config: &OptimizerConfig) -> Self {
+    pub fn new(config: &OptimizerConfig, device: &Device) -> Self {
         let weight_decay = config.weight_decay as f32;
         let [beta_1, beta_2] = config.betas.map(|beta| beta as f32);
         let adamw = AdamWConfig::new().with_beta_1(beta_1).with_beta_2(beta_2).with_epsilon(1e-8);
-        let adamw = adamw.with_weight_decay(weight_decay).init();
+        let adamw = adamw.with_weight_decay(weight_decay).build();
+        let on_device = OnDevice { optimizer: adamw.clone(), device: device.clone().inner() };
+        let all = ModuleOptimizer::from(adamw).with_group(ParamGroup::all(), on_device, None);
         match config.algorithm {
-            Algorithm::Adamw => Self { all: adamw, muon: None },
+            Algorithm::Adamw => Self { all, muon: None },
             Algorithm::Muon => {
                 let matrices = ParamGroup::from_regex(r"(^|\.)blocks\..*\.weight$").expect("a valid pattern");
                 let muon = Muon::new(f64::from(weight_decay));
-                Self { all: adamw.with_group(matrices.clone(), muon.clone(), None), muon: Some((muon, matrices)) }
+                let on_device = OnDevice { optimizer: muon.clone(), device: device.clone().inner() };
+                Self { all: all.with_group(matrices.clone(), on_device, None), muon: Some((muon, matrices)) }
             }
         }
     }
@@ -60,6 +67,44 @@ impl StageOptimizer {
     #[must_use]
     pub fn load_record(self, record: OptimizerRecord) -> Self {
         Self { all: self.all.load_record(record), ..self }
+    }
+}
+
+/// An optimizer whose loaded state is placed on `device`. Burn loads state on its default device, which is the GPU in a build
+/// with `wgpu`, also for a run on the CPU.
+struct OnDevice<O> {
+    optimizer: O,
+    device: Device,
+}
+
+impl<O: DynOptimizer> DynOptimizer for OnDevice<O> {
+    fn step_dyn(
+        &self,
+        rank: usize,
+        rate: LearningRate,
+        tensor: BridgeTensor,
+        grad: BridgeTensor,
+        state: Option<DynState>,
+    ) -> (BridgeTensor, Option<DynState>) {
+        self.optimizer.step_dyn(rank, rate, tensor, grad, state)
+    }
+
+    fn to_device_dyn(&self, state: DynState, device: &Device) -> DynState {
+        self.optimizer.to_device_dyn(state, device)
+    }
+
+    fn state_flatten(&self, prefix: &str, state: &DynState, out: &mut StateSink) {
+        self.optimizer.state_flatten(prefix, state, out);
+    }
+
+    fn state_unflatten(
+        &self,
+        rank: usize,
+        prefix: &str,
+        source: &mut StateSource,
+        _default: &Device,
+    ) -> Option<DynState> {
+        self.optimizer.state_unflatten(rank, prefix, source, &self.device)
     }
 }
 
@@ -118,7 +163,8 @@ pub fn scale_gradients<M: Module>(module: &M, grads: GradientsParams, factor: f6
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
+    use burn::optim::AdamWState;
+    use burn::tensor::TensorData;
 
     use super::*;
     use crate::testing::Reference;
@@ -142,12 +188,25 @@ mod tests {
     }
 
     #[test]
+    fn state_is_loaded_on_the_device_of_the_run() {
+        let device = clift_model::DeviceName::Ndarray.open().expect("a build for tests");
+        assert_ne!(Device::default(), device, "on which Burn would load it");
+        let mut source = StateSource::new([("1.momentum.time".to_owned(), 3_usize.into())].into());
+        for moment in ["moment_1", "moment_2"] {
+            source.insert_tensor(format!("1.momentum.{moment}"), TensorData::from([1.0_f32, 2.0]));
+        }
+        let optimizer = OnDevice { optimizer: AdamWConfig::new().build(), device: device.clone() };
+        let state = optimizer.state_unflatten(1, "1", &mut source, &Device::default()).expect("a whole state");
+        assert_eq!(state.downcast::<AdamWState<1>>().momentum.moment_2.device(), device);
+    }
+
+    #[test]
     fn betas_of_zero_leave_the_sign_of_the_gradient() {
         let fixture = Reference::open("reference/adamw");
         let device = Device::flex();
         let mut model = toy(&fixture, &device.clone().autodiff());
         let config = OptimizerConfig { betas: [0.0, 0.0], weight_decay: 0.0, ..OptimizerConfig::default() };
-        let mut optimizer = StageOptimizer::new(&config);
+        let mut optimizer = StageOptimizer::new(&config, &device);
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         for step in 0..2 {
             let grad = grads_a.clone().narrow(0, step, 1).squeeze_dim::<2>(0);
@@ -165,7 +224,7 @@ mod tests {
         let device = Device::flex();
         // Parameters that train live with autodiff, their gradients without.
         let mut model = toy(&fixture, &device.clone().autodiff());
-        let mut optimizer = StageOptimizer::new(&OptimizerConfig::default());
+        let mut optimizer = StageOptimizer::new(&OptimizerConfig::default(), &device);
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         let grads_b: Tensor<2> = fixture.tensor("input.grad_b", &device);
         for (step, rate) in fixture.values("output.lr").into_iter().take(5).enumerate() {
@@ -210,7 +269,7 @@ mod tests {
         let names = ["wide", "tall", "wide"];
         let mut model = Matrices { blocks: vec![block("wide"), block("tall")], outside: block("wide") };
         let config = OptimizerConfig { algorithm: Algorithm::Muon, ..OptimizerConfig::default() };
-        let mut optimizer = StageOptimizer::new(&config);
+        let mut optimizer = StageOptimizer::new(&config, &device);
         for step in 0..5 {
             let of_step = |kind: &str, name: &str| {
                 let all: Tensor<3> = fixture.tensor(&format!("{kind}_{name}"), &device);

@@ -51,7 +51,7 @@ pub struct Update {
 impl TrainState {
     /// Makes the state before the first update: mean squared error, f32, activations stored.
     pub fn new(model: Clift, optimizer: &OptimizerConfig, device: Device) -> Self {
-        let (optimizer, loss) = (StageOptimizer::new(optimizer), Loss::default());
+        let (optimizer, loss) = (StageOptimizer::new(optimizer, &device), Loss::default());
         Self {
             model,
             optimizer,

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clift_data::{ClipReader, Split};
 use clift_eval::{EvalFrames, EvalSplit, FittedCodec};
 use clift_model::TokenCodec;
@@ -10,8 +11,8 @@ use clift_train::fit_token_codec;
 use crate::commands::args::model_args::ModelArgs;
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::exit_code::usage_bail;
 use crate::interrupt;
+use crate::output::output_file::OutputFile;
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::print_result;
 use crate::output::table::table;
@@ -39,9 +40,7 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
     let model_args = ModelArgs::new(&args.model, args.data.as_deref(), &args.overrides)?;
     let ModelArgs { path, config, .. } = &model_args;
     let out = TokenCodec::path_of(&path.weights);
-    if !args.force && out.exists() {
-        usage_bail!("the codec {} exists; scenes coded with it need it; replace it with --force", out.display());
-    }
+    OutputFile::new(&out, args.force, &[]).context("scenes coded with the codec need it")?;
     let opened = model_args.open_data(args.split)?;
     // Also of a DIR, which may be the capture that the run was trained on.
     let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };

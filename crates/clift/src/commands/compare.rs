@@ -9,10 +9,11 @@ use crate::commands::args::shared_args::JsonArg;
 use crate::output::stdout::print_result;
 
 pub fn run(args: &CompareArgs) -> anyhow::Result<()> {
+    let json = args.json.open(&[&args.a, &args.b])?;
     let (a, b) = (Evaluation::read(&args.a)?, Evaluation::read(&args.b)?);
     let comparison = Comparison::new(&a, &b, args.methods.as_ref())?;
     print_result(comparison.to_string().trim_end())?;
-    args.json.write(&comparison)
+    json.write(&comparison)
 }
 
 #[derive(Debug, clap::Args)]

@@ -12,9 +12,9 @@ use serde::Serialize;
 
 use crate::commands::args::model_args::ModelArgs;
 use crate::commands::args::parse::{parse_kb, parse_loss, parse_output, parse_split};
-use crate::commands::args::shared_args::{ConfigArgs, require_free};
+use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
-use crate::output::json::write_json;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
 
@@ -107,9 +107,11 @@ impl<'a> ClustersFile<'a> {
 /// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
-    for path in [Some(&args.out), args.save_clusters.as_ref()].into_iter().flatten() {
-        require_free(path, args.force)?;
-    }
+    // `check_output_path` refuses files that are not scenes, and no input is a scene.
+    OutputFile::new(&args.out, args.force, &[])?;
+    let inputs: Vec<&Path> =
+        [Some(&args.model), args.data.as_ref()].into_iter().flatten().map(PathBuf::as_path).collect();
+    let clusters = args.save_clusters.as_ref().map(|path| OutputFile::new(path, args.force, &inputs)).transpose()?;
     if args.save_clusters.as_ref() == Some(&args.out) {
         usage_bail!("--save-clusters and -o name one file, {}; choose another name", args.out.display());
     }
@@ -137,8 +139,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let storage = coding.storage(args, &options, &reader);
     let mut encoded = encode(&model, &reader, scene, &EncodeOptions { storage, ..options })?;
     let written = coding.write(&mut encoded, args, (&model, &reader, scene))?;
-    if let Some(path) = &args.save_clusters {
-        write_json(&ClustersFile::of(&encoded), path)?;
+    if let Some(file) = clusters {
+        file.write_json(&ClustersFile::of(&encoded))?;
     }
     print_result(&describe(&encoded, &written, &args.out, &names))?;
     warn_of_turn(&encoded.scene);

@@ -47,10 +47,11 @@ struct Sizes {
 }
 
 pub fn run(args: &FlopsArgs) -> anyhow::Result<()> {
+    let json = args.json.open(args.config.as_deref().as_slice())?;
     let sizes = sizes(args)?;
     let counts = count(&sizes, args.convention)?;
     print_result(&report_text(&counts, args.convention))?;
-    args.json.write(&counts)
+    json.write(&counts)
 }
 
 fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
@@ -127,7 +128,7 @@ mod tests {
     use super::*;
 
     fn counts(convention: FlopConvention) -> Counts {
-        let json = JsonArg { path: None };
+        let json = JsonArg { path: None, force: false };
         let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };
         count(&sizes(&args).unwrap(), convention).unwrap()
     }
@@ -135,7 +136,7 @@ mod tests {
     #[test]
     fn configs_need_no_data() {
         let config = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/re10k.toml").into();
-        let json = JsonArg { path: None };
+        let json = JsonArg { path: None, force: false };
         let args = FlopsArgs {
             config: Some(config),
             convention: FlopConvention::Macs,

@@ -5,15 +5,16 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::replace_file;
 use clift_train::Stage;
 use serde::Deserialize;
 
-use crate::commands::args::shared_args::require_free;
 use crate::exit_code::usage_bail;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
 use crate::output::tensorboard::{Scalar, event_file};
 
+/// Stages with curves.
+const STAGES: [Stage; 2] = [Stage::Stage1, Stage::Stage2];
 /// Columns of a step, as in `metrics.jsonl`.
 const STEP_KEYS: [&str; 5] = ["loss", "psnr", "lr", "grad_norm", "step_s"];
 /// Columns of a validation, as in `validation.jsonl`.
@@ -47,17 +48,17 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<()> {
         usage_bail!("set --csv FILE, --tensorboard DIR or both");
     }
     let rows = read_rows(&args.run)?;
-    if let Some(path) = &args.csv {
-        require_free(path, args.force)?;
-        write(path, &csv(&rows))?;
+    let mut files: Vec<(PathBuf, Vec<u8>)> = args.csv.iter().map(|path| (path.clone(), csv(&rows))).collect();
+    for (folder, stage) in args.tensorboard.iter().flat_map(|folder| STAGES.map(|stage| (folder, stage))) {
+        let Some((_, first)) = rows.iter().find(|((found, _), _)| *found == stage) else { continue };
+        let path = folder.join(stage.name()).join("events.out.tfevents.0.clift");
+        files.push((path, event_file(first.time, scalars(&rows, stage))));
     }
-    if let Some(folder) = &args.tensorboard {
-        for stage in [Stage::Stage1, Stage::Stage2] {
-            let path = folder.join(stage.name()).join("events.out.tfevents.0.clift");
-            let Some(((_, _), first)) = rows.iter().find(|((found, _), _)| *found == stage) else { continue };
-            require_free(&path, args.force)?;
-            write(&path, &event_file(first.time, scalars(&rows, stage)))?;
-        }
+    let check = |(path, content)| Ok((OutputFile::new(path, args.force, &[&args.run])?, content));
+    let files = files.iter().map(|(path, content)| check((path, content))).collect::<anyhow::Result<Vec<_>>>()?;
+    for (file, content) in files {
+        file.write(content)?;
+        print_result(&file.path().display().to_string())?;
     }
     Ok(())
 }
@@ -126,15 +127,6 @@ fn scalars(rows: &Rows, stage: Stage) -> impl Iterator<Item = Scalar<'static>> {
         .flatten()
         .collect::<Vec<_>>()
     })
-}
-
-fn write(path: &Path, content: &[u8]) -> anyhow::Result<()> {
-    let writing = || format!("writing {}", path.display());
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder).with_context(writing)?;
-    }
-    replace_file(path, content).with_context(writing)?;
-    print_result(&path.display().to_string())
 }
 
 /// Arguments of `clift metrics`.

@@ -13,6 +13,7 @@ use crate::output::table::table;
 use crate::output::units::{duration, file_size, memory_size, seconds};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
+    let json = args.json.open(&[&args.config])?;
     let config = args.overrides.read(&args.config, check_plan)?;
     for missing in missing_weights(&config) {
         print_warning(missing);
@@ -24,7 +25,7 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     if let Some(warning) = memory_warning(&config, plan.available_bytes)? {
         print_warning(warning);
     }
-    args.json.write(&plan)
+    json.write(&plan)
 }
 
 fn largest_tensors(config: &Config) -> anyhow::Result<String> {

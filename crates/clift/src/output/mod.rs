@@ -3,7 +3,7 @@
 //! - `units`: seconds, bytes, counts
 //! - `visible`: control characters escaped
 //! - `table`: aligned columns
-//! - `json`: results as JSON files
+//! - `output_file`: files that are written, checked beforehand
 //! - `tensorboard`: event files
 //! - `verbosity`: `--quiet` and `--verbose`
 //! - `stdout`: results to stdout, notes to stderr
@@ -16,7 +16,7 @@
 pub(crate) mod bar;
 pub(crate) mod counter;
 pub(crate) mod event_line;
-pub(crate) mod json;
+pub(crate) mod output_file;
 pub(crate) mod plain;
 pub(crate) mod progress_sink;
 pub(crate) mod stdout;

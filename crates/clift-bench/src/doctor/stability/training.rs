@@ -37,7 +37,7 @@ const STEPS: usize = 20;
 /// Returns the losses of [`STEPS`] updates on one batch.
 fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -> Result<Vec<f64>, TrainError> {
     let config = OptimizerConfig::default();
-    let mut optimizer = StageOptimizer::new(&config);
+    let mut optimizer = StageOptimizer::new(&config, device);
     let device = device.clone().autodiff();
     let mut losses = Vec::new();
     for _ in 0..STEPS {

@@ -8,8 +8,7 @@ use clift_train::{Config, Override, TrainError, read_checked_config};
 use serde::Serialize;
 
 use crate::commands::args::parse::parse_output;
-use crate::exit_code::usage_bail;
-use crate::output::json::write_json;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
 /// Options that override keys of a config.
@@ -51,23 +50,29 @@ pub struct JsonArg {
     // Another id than the field's, which arguments with this one flattened may have themselves.
     #[arg(id = "json", long, value_name = "FILE", value_parser = parse_output)]
     pub path: Option<PathBuf>,
+    /// Replace existing files
+    #[arg(long)]
+    pub force: bool,
 }
 
 impl JsonArg {
-    /// Writes the file, if one is given, and prints its path.
-    pub fn write(&self, results: &impl Serialize) -> anyhow::Result<()> {
-        let Some(path) = &self.path else { return Ok(()) };
-        write_json(results, path)?;
-        print_result(&format!("results: {}", path.display()))
+    /// Checks the file, if one is given, before the work on `inputs`.
+    pub fn open(&self, inputs: &[&Path]) -> anyhow::Result<JsonFile> {
+        let file = self.path.as_ref().map(|path| OutputFile::new(path, self.force, inputs));
+        Ok(JsonFile(file.transpose()?))
     }
 }
 
-/// Refuses a path where something exists, unless it may be replaced.
-pub fn require_free(path: &Path, force: bool) -> anyhow::Result<()> {
-    if !force && path.exists() {
-        usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
+/// The file of `--json`, if one is given.
+pub struct JsonFile(Option<OutputFile>);
+
+impl JsonFile {
+    /// Writes the file and prints its path.
+    pub fn write(&self, results: &impl Serialize) -> anyhow::Result<()> {
+        let Some(file) = &self.0 else { return Ok(()) };
+        file.write_json(results)?;
+        print_result(&format!("results: {}", file.path().display()))
     }
-    Ok(())
 }
 
 /// Options of written scenes.

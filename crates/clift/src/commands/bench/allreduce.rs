@@ -25,10 +25,11 @@ pub struct BenchAllReduceArgs {
 pub fn run(args: &BenchAllReduceArgs) -> anyhow::Result<()> {
     let ranks = connect()?;
     let measure = || -> anyhow::Result<()> {
+        let json = ranks.is_root().then(|| args.json.open(&[])).transpose()?;
         let report = measure_allreduce(&ranks, &args.values, args.repeats)?;
-        if ranks.is_root() {
+        if let Some(json) = json {
             print_result(&report_text(&report))?;
-            args.json.write(&report)?;
+            json.write(&report)?;
         }
         Ok(())
     };

@@ -18,7 +18,9 @@ use crate::output::units::{memory_size, seconds};
 
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
-    let config = timing.config.read(args.config.as_deref().unwrap_or(Path::new("")), |_| Ok(()))?;
+    let path = args.config.as_deref().unwrap_or(Path::new(""));
+    let json = timing.json.open(&[path])?;
+    let config = timing.config.read(path, |_| Ok(()))?;
     let options = timing.options(BenchCase::ALL);
     let options = BenchOptions { error: !args.no_error, features: args.features.clone(), ..options };
     let stop = interrupt::flag()?;
@@ -36,7 +38,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     drop(counter);
     let report = report?;
     print_result(&report_text(&report))?;
-    timing.json.write(&report)
+    json.write(&report)
 }
 
 fn report_text(report: &BenchReport) -> String {

@@ -50,6 +50,7 @@ struct Report {
 }
 
 pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
+    let json = args.json.open(&[&args.dir])?;
     let _peak = start_peak();
     if args.split == Splits::Both {
         usage_bail!("--split both: one split is measured; write train or test");
@@ -75,7 +76,7 @@ pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
     let throughput = measure_reading(&split.opened.source, &options)?;
     let report = Report { peak_bytes: peak_bytes(), throughput };
     print_result(&report_text(&report, args.views))?;
-    args.json.write(&report)
+    json.write(&report)
 }
 
 fn report_text(report: &Report, [num_context, num_targets]: [usize; 2]) -> String {

@@ -20,10 +20,11 @@ pub struct BenchPrecisionArgs {
 
 pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
+    let json = timing.json.open(&[&args.config])?;
     let config = timing.config.read(&args.config, |_| Ok(()))?;
     let report = compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag()?)?;
     print_result(&report_text(&report))?;
-    timing.json.write(&report)
+    json.write(&report)
 }
 
 fn report_text(report: &PrecisionReport) -> String {

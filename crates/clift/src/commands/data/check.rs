@@ -1,12 +1,9 @@
 //! `clift data check`.
 
-use std::fs;
 use std::path::PathBuf;
 
-use anyhow::Context;
 use clift_data::{
-    CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, replace_file,
-    skipped_scenes,
+    CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, skipped_scenes,
 };
 use clift_eval::file_name;
 use serde::Serialize;
@@ -14,6 +11,7 @@ use serde::Serialize;
 use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;
 use crate::output::visible::visible_line;
@@ -41,15 +39,13 @@ impl Report {
 
 /// Checks every scene and prints the table; fails if a scene is flagged, or if there are none.
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
-    if let Some(folder) = &args.images {
-        fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;
-    }
+    let json = args.json.open(&[&args.source.dir])?;
     let mut report = Report { scenes: Vec::new(), notes: Vec::new() };
     for split in args.source.open(args.split)? {
         check_split(&split, args, &mut report)?;
     }
     print_result(&report_text(&report))?;
-    args.json.write(&report)?;
+    json.write(&report)?;
     anyhow::ensure!(!report.scenes.is_empty(), "no scenes to check in {}", args.source.dir.display());
     let flagged = report.count(Verdict::Flagged);
     anyhow::ensure!(
@@ -68,13 +64,18 @@ fn check_split(split: &SplitSource, args: &CheckArgs, report: &mut Report) -> an
     report.notes.extend_from_slice(&skips.notes);
     report.scenes.extend(skipped_scenes(skips).into_iter().map(|check| Row { split: split.split, check }));
     let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
+    let image_file = |folder: &PathBuf, scene: usize| {
+        let path = folder.join(image_name(split.split, source.key(scene)));
+        OutputFile::new(&path, args.json.force, &[&args.source.dir])
+    };
+    let all = args.images.iter().flat_map(|folder| (0..num_scenes).map(move |scene| image_file(folder, scene)));
+    let images = all.collect::<anyhow::Result<Vec<OutputFile>>>()?;
     let mut counter = Counter::new(&split.name(), num_scenes as u64);
     for scene in 0..num_scenes {
         let CheckedScene { mut check, image } = check_scene(source.as_ref(), scene);
         note_skipped_frames(skips, &mut check);
-        if let (Some(folder), Some(image)) = (&args.images, image) {
-            let path = folder.join(image_name(split.split, &check.key));
-            replace_file(&path, &encode_png(&image)?).with_context(|| format!("writing {}", path.display()))?;
+        if let (Some(file), Some(image)) = (images.get(scene), image) {
+            file.write(&encode_png(&image)?)?;
         }
         report.scenes.push(Row { split: split.split, check });
         counter.set(scene as u64 + 1);

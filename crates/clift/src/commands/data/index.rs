@@ -6,7 +6,7 @@ use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 
 use crate::commands::args::parse::{parse_distance, parse_output};
 use crate::commands::args::splits::{SourceArgs, Splits};
-use crate::exit_code::usage_bail;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
 pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
@@ -19,9 +19,7 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
         seed: args.seed,
     };
     options.validate()?;
-    if args.out.exists() {
-        usage_bail!("{} exists; remove it or choose another file", args.out.display());
-    }
+    OutputFile::new(&args.out, args.force, &[&args.source.dir])?;
     let splits = args.source.open(args.split)?;
     for split in &splits {
         split.print_report();
@@ -50,6 +48,9 @@ pub struct IndexArgs {
     /// Index file to write
     #[arg(long, short, value_name = "FILE", value_parser = parse_output)]
     pub out: PathBuf,
+    /// Replace an existing file
+    #[arg(long)]
+    pub force: bool,
     /// Use this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Test)]
     pub split: Splits,

@@ -26,6 +26,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     if !args.path.exists() {
         usage_bail!("{}: no such file or folder", args.path.display());
     }
+    let json = args.json.open(&[&args.path])?;
     let is_json = args.path.extension().is_some_and(|extension| extension == "json");
     // A scene may be given by one of its camera files, e.g. transforms_train.json.
     let name = args.path.file_name().unwrap_or_default().to_string_lossy();
@@ -33,7 +34,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     if is_json && !is_scene {
         let statistics = IndexStatistics::new(&EvaluationIndex::read(&args.path)?);
         print_result(&format!("{statistics}\n"))?;
-        return args.json.write(&statistics);
+        return json.write(&statistics);
     }
     let report = if args.path.is_dir() || is_scene {
         if !args.set.is_empty() {
@@ -45,7 +46,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
         describe_config(&args.path, &config)?
     };
     print_result(&report.to_string())?;
-    args.json.write(&report)?;
+    json.write(&report)?;
     let failed = report.splits.values().filter_map(|split| split.error.as_ref());
     let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
     anyhow::ensure!(failed.count() == 0, "a part of the data is not usable; the table above lists the reason");

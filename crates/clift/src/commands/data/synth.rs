@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use anyhow::Context;
 use clift_data::{
-    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, plural,
-    write_evaluation_index, write_source,
+    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, TEMPORARY,
+    plural, publish_folder, write_evaluation_index, write_source,
 };
 use clift_eval::EvalConfig;
 use clift_model::ModelConfig;
@@ -58,9 +58,15 @@ fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyh
     let folder = args.out.join(split.to_string());
     let started = Instant::now();
     let mut counter = Counter::new(&split.to_string(), config.num_scenes as u64);
-    let written = write_source(&source, &folder, args.chunks.encoding(), args.chunks.target_bytes(), |done| {
+    let unfinished = args.out.join(format!("{TEMPORARY}{split}"));
+    if unfinished.exists() {
+        let removing = || format!("removing the folder of an interrupted command, {}", unfinished.display());
+        std::fs::remove_dir_all(&unfinished).with_context(removing)?;
+    }
+    let written = write_source(&source, &unfinished, args.chunks.encoding(), args.chunks.target_bytes(), |done| {
         counter.set(done as u64);
     })?;
+    publish_folder(&unfinished, &folder).with_context(|| format!("writing {}", folder.display()))?;
     drop(counter);
     let (scenes, frames) = (plural(written.num_scenes, "scene"), plural(config.num_frames, "frame"));
     let size = format!("{}x{}", config.width, config.height);
@@ -97,7 +103,7 @@ fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {
     Ok(config)
 }
 
-/// Checks that `out` contains nothing but the other split and its index.
+/// Checks that `out` contains nothing but the other split and its index, and what an interrupted command left.
 fn require_absent(out: &Path, splits: Splits) -> anyhow::Result<()> {
     if !out.exists() {
         return Ok(());
@@ -112,9 +118,14 @@ fn require_absent(out: &Path, splits: Splits) -> anyhow::Result<()> {
     for entry in folder {
         let path: PathBuf = entry.with_context(|| format!("reading {}", out.display()))?.path();
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        if !allowed.iter().any(|allowed| *allowed == name) {
-            usage_bail!("{} exists; choose another folder or move it away", path.display());
+        if name.starts_with(TEMPORARY) || allowed.iter().any(|allowed| *allowed == name) {
+            continue;
         }
+        let other = match (splits, name.as_ref()) {
+            (Splits::Both, "train") if !out.join("test").exists() => ", or write the other split with --split test",
+            _ => "",
+        };
+        usage_bail!("{} exists; choose another folder or move it away{other}", path.display());
     }
     Ok(())
 }
@@ -330,7 +341,9 @@ mod tests {
         assert_eq!(refused(Splits::Both), None);
         std::fs::create_dir(folder.path().join("train")).unwrap();
         assert_eq!(refused(Splits::Test), None);
-        assert!(refused(Splits::Both).unwrap().contains("train exists"));
+        std::fs::create_dir(folder.path().join(".clift-test")).unwrap();
+        assert_eq!(refused(Splits::Test), None, "of an interrupted command");
+        assert!(refused(Splits::Both).unwrap().ends_with("or write the other split with --split test"));
         std::fs::write(folder.path().join("notes.txt"), "").unwrap();
         assert!(refused(Splits::Test).unwrap().contains("notes.txt exists"));
         assert_eq!(require_absent(&folder.path().join("new"), Splits::Both).ok(), Some(()));

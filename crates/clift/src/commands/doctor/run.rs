@@ -8,6 +8,7 @@ use clift_model::{DeviceName, InstructionSet, Precision};
 
 use crate::commands::args::parse::parse_output;
 use crate::commands::doctor::{adapters, stability};
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 
@@ -22,7 +23,8 @@ const TOLERANCE_BF16: f64 = 2e-1;
 /// Prints the machine and a row per device, or runs the stability cases; fails with the default device or a case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
-        return stability::run(args.small, args.markdown.as_deref());
+        let markdown = args.markdown.as_ref().map(|path| OutputFile::new(path, args.force, &[])).transpose()?;
+        return stability::run(args.small, markdown.as_ref());
     }
     let machine = [("clift", version())].into_iter().chain(machine_rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
@@ -160,6 +162,9 @@ pub struct DoctorArgs {
     /// Write the table of the cases as Markdown
     #[arg(long, requires = "stability", value_name = "FILE", value_parser = parse_output)]
     pub markdown: Option<PathBuf>,
+    /// Replace an existing file
+    #[arg(long, requires = "markdown")]
+    pub force: bool,
 }
 
 #[cfg(test)]

@@ -1,23 +1,20 @@
 //! `clift doctor --stability`.
 
-use std::path::Path;
-
-use anyhow::Context;
 use clift_bench::{CaseSize, StabilityRow, outcome_text, run_stability, stability_markdown};
-use clift_data::replace_file;
 use clift_model::DeviceName;
 
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
 /// Runs every case on every device of the build; fails if an error exceeds its bound.
-pub fn run(is_small: bool, markdown: Option<&Path>) -> anyhow::Result<()> {
+pub fn run(is_small: bool, markdown: Option<&OutputFile>) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
     let size = if is_small { CaseSize::Small } else { CaseSize::Full };
     let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
-    if let Some(path) = markdown {
+    if let Some(file) = markdown {
         let text = format!("{}\n{}\n", markdown_head(is_small), stability_markdown(&devices, &rows));
-        replace_file(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
-        print_result(&format!("table: {}", path.display()))?;
+        file.write(text.as_bytes())?;
+        print_result(&format!("table: {}", file.path().display()))?;
     }
     let failed = rows.iter().filter(|row| !row.is_within_bound()).count();
     print_result(&format!("{} of {} cases within bounds on {}", rows.len() - failed, rows.len(), names(&devices)))?;
@@ -40,7 +37,7 @@ fn markdown_head(small: bool) -> String {
     format!(
         "# Numbers on hard scenes
 
-Made by `{command} --markdown docs/results/stability.md`, with a column for each device of the
+Made by `{command} --markdown docs/results/stability.md --force`, with a column for each device of the
 build (`--features ndarray`, `wgpu`); a small version of every case runs in `cargo test --workspace`.
 
 Each case is a real computation in f32, compared with the same code on the same values in f64, which uses the composed

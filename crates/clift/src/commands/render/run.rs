@@ -14,12 +14,11 @@ use clift_model::{
 };
 use serde::Serialize;
 
-use crate::commands::args::shared_args::require_free;
 use crate::commands::render::args::{CameraPath, RenderArgs};
 use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
-use crate::output::json::write_json;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
 
@@ -69,7 +68,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     }
     frames::check_out(&args.out, args.force)?;
     if let Some(video) = &args.video {
-        require_free(video, args.force)?;
+        OutputFile::new(video, args.force, &[&args.scene])?;
     }
     let views = path_cameras(&scene, args, height, width)?;
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
@@ -103,7 +102,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         tokens,
         calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
     };
-    write_json(&report, &files.path().join(frames::REPORT))?;
+    OutputFile::new(&files.path().join(frames::REPORT), false, &[])?.write_json(&report)?;
     files.commit().with_context(creating)?;
     frames::remove_later_frames(&args.out, views.len()).with_context(creating)?;
     print_result(&format!(
