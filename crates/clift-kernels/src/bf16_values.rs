@@ -4,8 +4,8 @@ use std::iter::once;
 
 use rayon::prelude::*;
 
-use crate::primitives::elementwise::PIECE;
 use crate::primitives::packing::pack_rows;
+use crate::primitives::partition::PIECE;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::{Bf16, Simd};
 

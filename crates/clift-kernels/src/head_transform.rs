@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::primitives::elementwise::PIECE;
+use crate::primitives::partition::rows_per_task;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -77,7 +77,7 @@ pub fn transform_heads(
         return;
     }
     assert!(x.len() / width * len == transforms.len() && x.len().is_multiple_of(width), "a transform per token");
-    let rows = PIECE.div_ceil(width);
+    let rows = rows_per_task(width);
     let pieces = x.par_chunks_mut(rows * width).zip(transforms.par_chunks(rows * len));
     pieces.for_each(|(x, transforms)| set.run(Rows { parts, num_heads, head_width, transforms, x }));
 }

@@ -1,10 +1,9 @@
-//! Layer normalization of rows and its gradient; sums over rows.
+//! Layer normalization of rows and its gradient.
 // N rows, D columns
 
 use rayon::prelude::*;
 
-use crate::primitives::elementwise::PIECE;
-use crate::primitives::shared_slice::SharedSlice;
+use crate::primitives::partition::{add, rows_per_sum, rows_per_task};
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -19,7 +18,7 @@ pub fn layer_norm_forward(
 ) {
     let dim = gamma.len();
     assert!(dim > 0 && beta.len() == dim && x.len() == statistics.len() * dim && output.len() == x.len());
-    let rows = rows_per_piece(dim);
+    let rows = rows_per_task(dim);
     let pieces = x.par_chunks(rows * dim).zip(output.par_chunks_mut(rows * dim)).zip(statistics.par_chunks_mut(rows));
     pieces.for_each(|((x, output), statistics)| {
         set.run(Forward { epsilon, x, gamma, beta, output, statistics });
@@ -39,8 +38,7 @@ pub fn layer_norm_backward(
     let dim = gamma.len();
     assert!(dim > 0 && grad_gamma.len() == dim && grad_beta.len() == dim && x.len() == statistics.len() * dim);
     assert!(grad.len() == x.len() && grad_x.len() == x.len());
-    // Divided by shape, so that sums do not depend on the number of threads.
-    let rows = statistics.len().div_ceil(MAX_PARTS).max(rows_per_piece(dim));
+    let rows = rows_per_sum(statistics.len(), dim);
     let parts = statistics.len().div_ceil(rows);
     let mut sums = vec![0.0; 2 * parts * dim];
     let pieces = x
@@ -55,18 +53,10 @@ pub fn layer_norm_backward(
     grad_gamma.fill(0.0);
     grad_beta.fill(0.0);
     for sums in sums.chunks_exact(2 * dim) {
-        for (i, (gamma, beta)) in grad_gamma.iter_mut().zip(&mut *grad_beta).enumerate() {
-            *gamma += sums[i];
-            *beta += sums[dim + i];
-        }
+        let (gamma, beta) = sums.split_at(dim);
+        add(gamma, grad_gamma);
+        add(beta, grad_beta);
     }
-}
-
-/// Most parts of the rows that are summed separately.
-const MAX_PARTS: usize = 64;
-
-fn rows_per_piece(dim: usize) -> usize {
-    PIECE.div_ceil(dim)
 }
 
 struct Forward<'a> {
@@ -171,43 +161,6 @@ fn sum_of_squares<S: Simd>(simd: S, values: &[f32], mean: f32) -> f32 {
     values[full..].iter().fold(simd.sum(total), |total, value| total + (value - mean).powi(2))
 }
 
-/// Sums the columns of `x`, `to[c] = sum over rows of x[.., c]`: the gradient of a bias.
-pub fn sum_rows(set: InstructionSet, x: &[f32], to: &mut [f32]) {
-    let dim = to.len();
-    let count = x.len() / dim;
-    assert!(dim > 0 && x.len() == count * dim, "x has whole rows");
-    let rows = count.div_ceil(MAX_PARTS).max(rows_per_piece(dim));
-    let mut sums = vec![0.0; count.div_ceil(rows) * dim];
-    let parts = SharedSlice::new(&mut sums);
-    x.par_chunks(rows * dim).enumerate().for_each(|(part, x)| {
-        // SAFETY: every task has its own part.
-        let to = unsafe { parts.part(part * dim, dim) };
-        set.run(SumRows { x, to });
-    });
-    to.fill(0.0);
-    for sums in sums.chunks_exact(dim) {
-        to.iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
-    }
-}
-
-struct SumRows<'a> {
-    x: &'a [f32],
-    to: &'a mut [f32],
-}
-
-impl Kernel for SumRows<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        for x in self.x.chunks_exact(self.to.len()) {
-            for (x, to) in x.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {
-                simd.write(to, simd.add(simd.read(to), simd.read(x)));
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -247,9 +200,6 @@ mod tests {
             for (got, expected) in grads.iter().zip(&expected[1..]) {
                 assert_close(got, expected, 1e-5);
             }
-            let mut sums = vec![f32::NAN; dim];
-            sum_rows(set, &grad, &mut sums);
-            assert_close(&sums, &expected[3], 1e-5);
         }
     }
 

@@ -51,7 +51,7 @@ pub use cluster_attention::{ClusterSegments, cluster_attention_backward, cluster
 pub use head_transform::{HeadTransform, transform_heads, transform_len};
 // Layers
 pub use gelu::{gelu_backward, gelu_forward};
-pub use layer_norm::{layer_norm_backward, layer_norm_forward, sum_rows};
-pub use linear::linear_forward;
+pub use layer_norm::{layer_norm_backward, layer_norm_forward};
+pub use linear::{linear_forward, sum_rows};
 pub use matmul_bf16::{Matrix, matmul_bf16};
 pub use rms_norm::{HeadRows, rms_norm_backward, rms_norm_forward};

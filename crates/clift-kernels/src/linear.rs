@@ -1,10 +1,12 @@
-//! Linear layers, `y = x W + b`, on the `gemm` crate.
+//! Linear layers, `y = x W + b`, on the `gemm` crate, and the gradient of the bias.
 // N rows, I inputs, O outputs
 
 use gemm::Parallelism;
 use rayon::prelude::*;
 
-use crate::primitives::elementwise::PIECE;
+use crate::primitives::partition::{add, rows_per_sum, rows_per_task};
+use crate::simd::dispatch::{InstructionSet, Kernel};
+use crate::simd::vector::Simd;
 
 /// Fewest multiply-accumulates that are divided among threads.
 const PARALLEL: usize = 1 << 20;
@@ -18,7 +20,7 @@ pub fn linear_forward([rows, inputs, outputs]: [usize; 3], [x, weight, bias]: [&
     if output.is_empty() {
         return;
     }
-    output.par_chunks_mut(PIECE.div_ceil(outputs) * outputs).for_each(|piece| {
+    output.par_chunks_mut(rows_per_task(outputs) * outputs).for_each(|piece| {
         piece.chunks_exact_mut(outputs).for_each(|row| row.copy_from_slice(bias));
     });
     let parallelism = if rows * inputs * outputs < PARALLEL { Parallelism::None } else { Parallelism::Rayon(0) };
@@ -48,6 +50,36 @@ pub fn linear_forward([rows, inputs, outputs]: [usize; 3], [x, weight, bias]: [&
     }
 }
 
+/// Sums the columns of `x`, `to[c] = sum over rows of x[.., c]`: the gradient of a bias.
+pub fn sum_rows(set: InstructionSet, x: &[f32], to: &mut [f32]) {
+    let dim = to.len();
+    let count = x.len() / dim;
+    assert!(dim > 0 && x.len() == count * dim, "x has whole rows");
+    let rows = rows_per_sum(count, dim);
+    let mut sums = vec![0.0; count.div_ceil(rows) * dim];
+    x.par_chunks(rows * dim).zip(sums.par_chunks_mut(dim)).for_each(|(x, to)| set.run(SumRows { x, to }));
+    to.fill(0.0);
+    sums.chunks_exact(dim).for_each(|sums| add(sums, to));
+}
+
+struct SumRows<'a> {
+    x: &'a [f32],
+    to: &'a mut [f32],
+}
+
+impl Kernel for SumRows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        for x in self.x.chunks_exact(self.to.len()) {
+            for (x, to) in x.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {
+                simd.write(to, simd.add(simd.read(to), simd.read(x)));
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -67,6 +99,20 @@ mod tests {
             let mut output = vec![f32::NAN; rows * outputs];
             linear_forward([rows, inputs, outputs], [&x, &weight, &bias], &mut output);
             assert_close(&output, &expected, 1e-5);
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_sums_rows_as_f64() {
+        for [rows, dim] in [[1, 5], [3, 12], [777, 37], [500, 96], [65, 768]] {
+            let x = random(rows * dim, 4);
+            let column = |c: usize| x.iter().skip(c).step_by(dim).map(|&value| f64::from(value)).sum();
+            let expected: Vec<f64> = (0..dim).map(column).collect();
+            for set in InstructionSet::available() {
+                let mut sums = vec![f32::NAN; dim];
+                sum_rows(set, &x, &mut sums);
+                assert_close(&sums, &expected, 1e-5);
+            }
         }
     }
 }

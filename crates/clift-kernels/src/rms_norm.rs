@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::primitives::elementwise::PIECE;
+use crate::primitives::partition::{add, rows_per_sum, rows_per_task};
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -36,7 +36,7 @@ impl HeadRows {
 /// If the lengths differ from the shapes.
 pub fn rms_norm_forward(set: InstructionSet, rows: HeadRows, gammas: &[f32], x: &mut [f32]) {
     check(&rows, gammas, x);
-    x.par_chunks_mut(rows_per_piece(&rows) * rows.len()).for_each(|x| set.run(Forward { rows, gammas, x }));
+    x.par_chunks_mut(rows_per_task(rows.len()) * rows.len()).for_each(|x| set.run(Forward { rows, gammas, x }));
 }
 
 /// Computes the gradients of `x`, in place of the gradient of the output, and adds those of `gammas` to `grad_gammas`.
@@ -55,21 +55,11 @@ pub fn rms_norm_backward(
 ) {
     check(&rows, gammas, x);
     assert!(grad.len() == x.len() && grad_gammas.len() == gammas.len(), "a gradient per value");
-    // Divided by shape, so that sums do not depend on the number of threads.
-    let count = (x.len() / rows.len()).div_ceil(MAX_PIECES).max(rows_per_piece(&rows)) * rows.len();
+    let count = rows_per_sum(x.len() / rows.len(), rows.len()) * rows.len();
     let mut sums = vec![0.0; x.len().div_ceil(count) * gammas.len()];
     let pieces = x.par_chunks(count).zip(grad.par_chunks_mut(count)).zip(sums.par_chunks_mut(gammas.len()));
     pieces.for_each(|((x, grad), sums)| set.run(Backward { rows, x, gammas, grad, sums }));
-    for sums in sums.chunks_exact(gammas.len()) {
-        grad_gammas.iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
-    }
-}
-
-/// Most pieces whose gradients of gamma are summed separately.
-const MAX_PIECES: usize = 64;
-
-fn rows_per_piece(rows: &HeadRows) -> usize {
-    PIECE.div_ceil(rows.len())
+    sums.chunks_exact(gammas.len()).for_each(|sums| add(sums, grad_gammas));
 }
 
 fn check(rows: &HeadRows, gammas: &[f32], x: &[f32]) {

@@ -88,9 +88,9 @@ pub use network::blocks::attention::SelfAttention;
 pub use network::blocks::block::{DecoderBlock, EncoderBlock};
 pub use network::blocks::feed_forward::{Activation, FeedForward};
 pub use network::blocks::norms::LiftNorm;
-pub use ops::attention::composed::MAX_SCORES;
-pub use ops::attention::sdpa::{cross_sdpa, self_sdpa};
-pub use ops::cluster_attention::operation::cluster_attention;
+pub use ops::attention::{cross_sdpa, self_sdpa};
+pub use ops::cluster_attention::cluster_attention;
+pub use ops::composed::attention::MAX_SCORES;
 pub use ops::linear::{gelu_linear, linear, norm_linear};
 // Parameters, multiply-accumulates and memory of a network
 pub use cost::largest_tensor::{kmeans_values, largest_tensors};

@@ -141,6 +141,29 @@ pub fn output_and_gradients<const COUNT: usize>(
     (output.inner(), gradients)
 }
 
+/// Asserts that output and gradients of `f` equal those of `expected`, to `tolerance` of the largest expected value.
+#[track_caller]
+pub fn check_equal<const COUNT: usize>(
+    inputs: [Tensor<3>; COUNT],
+    cotangent: Tensor<3>,
+    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+    expected: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+    tolerance: f64,
+) {
+    let (output, grads) = output_and_gradients(inputs.clone(), cotangent.clone(), f);
+    let (expected, expected_grads) = output_and_gradients(inputs, cotangent, expected);
+    assert_close(&output, &expected, tolerance);
+    for (grad, expected) in grads.iter().zip(&expected_grads) {
+        assert_close(grad, expected, tolerance);
+    }
+}
+
+/// Asserts that no gradient is infinite or NaN.
+#[track_caller]
+pub fn assert_finite<const COUNT: usize>(grads: [Tensor<3>; COUNT]) {
+    assert!(grads.into_iter().all(|grad| grad.is_finite().all().into_scalar::<bool>()));
+}
+
 /// Asserts that output and gradients of `f` in f32 (native kernels on flex) equal the results in f64 (composed
 /// operations). Results that are zero in f64 are not compared.
 #[track_caller]

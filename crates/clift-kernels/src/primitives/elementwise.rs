@@ -2,11 +2,9 @@
 
 use rayon::prelude::*;
 
+use crate::primitives::partition::PIECE;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
-
-/// Values per task: a piece of each slice that stays in the cache.
-pub(crate) const PIECE: usize = 1 << 14;
 
 /// A function `to = f(from, to)` of vectors.
 pub(crate) trait Elementwise: Copy + Sync {

@@ -4,7 +4,7 @@
 use crate::cost::scene_sizes::SceneSizes;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Sequence};
-use crate::ops::attention::composed::MAX_SCORES;
+use crate::ops::composed::attention::MAX_SCORES;
 use crate::tokens::kmeans::seeding::{MAX_TABLE_LEN, pool_len};
 
 /// Lists the tensors of one network that can be its largest, for a batch of equal scenes: description and number of

@@ -193,7 +193,7 @@ mod tests {
     use burn::tensor::DType;
 
     use super::*;
-    use crate::ops::attention::sdpa::cross_sdpa;
+    use crate::ops::attention::cross_sdpa;
     use crate::testing::{Fixture, assert_close, cpu_devices, devices, output_and_gradients};
 
     fn maker(encoding: CameraEncoding) -> TransformMaker {

@@ -12,7 +12,7 @@ use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::released_condenser::ReleasedCondenser;
 use crate::network::tokens::Tokens;
-use crate::ops::cluster_attention::operation::cluster_attention;
+use crate::ops::cluster_attention::cluster_attention;
 use crate::ops::linear::linear_in_f32;
 use crate::tokens::clusters::ClusterIndex;
 

@@ -10,7 +10,7 @@ use crate::network::blocks::attention::{CrossAttention, SelfAttention};
 use crate::network::blocks::feed_forward::{Activation, FeedForward};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
-use crate::ops::cluster_attention::operation::cluster_attention;
+use crate::ops::cluster_attention::cluster_attention;
 use crate::ops::linear::linear_in_f32;
 use crate::tokens::clusters::ClusterIndex;
 

@@ -1,24 +1,66 @@
-//! Gradients of an operation with a hand-written backward.
+//! An operation with a hand-written backward as a node of the autodiff graph.
 
-use burn::backend::Backend;
+use std::fmt::Debug;
+use std::marker::PhantomData;
+
+use burn::backend::autodiff::checkpoint::base::Checkpointer;
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::Ops;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
+use burn::backend::{Autodiff, Backend};
 
-/// Takes the gradient of an operation's output and registers the gradients of its inputs, which `gradients` computes from
-/// the saved state. `gradients` receives one flag per input and may skip inputs without gradient.
-pub(crate) fn register<B: Backend, S, const N: usize>(
-    ops: Ops<S, N>,
-    grads: &mut Gradients,
-    gradients: impl FnOnce(S, FloatTensor<B>, [bool; N]) -> [Option<FloatTensor<B>>; N],
-) where
-    S: Clone + Send + std::fmt::Debug + 'static,
-{
-    let grad_output = grads.consume::<B>(&ops.node);
-    let needed = ops.parents.each_ref().map(Option::is_some);
-    for (parent, gradient) in ops.parents.into_iter().zip(gradients(ops.state, grad_output, needed)) {
-        if let (Some(node), Some(gradient)) = (parent, gradient) {
-            grads.register::<B>(node.id, gradient);
+/// An operation on `N` float tensors with its gradients. A value of the type has the settings, and tensors without gradient.
+pub(crate) trait Differentiable<B: Backend, const N: usize>: Clone + Debug + Send + 'static {
+    /// Tensors that the gradients are computed from.
+    type Saved: Clone + Debug + Send + 'static;
+
+    /// Computes the output.
+    fn forward(&self, inputs: [FloatTensor<B>; N]) -> FloatTensor<B>;
+
+    /// Computes the output, and what the gradients need.
+    fn forward_saving(&self, inputs: [FloatTensor<B>; N]) -> (FloatTensor<B>, Self::Saved);
+
+    /// Computes the gradients of the inputs from that of the output. Those that are not `needed` may be `None`.
+    fn gradients(
+        &self,
+        saved: Self::Saved,
+        grad_output: FloatTensor<B>,
+        needed: [bool; N],
+    ) -> [Option<FloatTensor<B>>; N];
+}
+
+/// Computes the output of an operation under autodiff; saves for the backward only if an input needs a gradient.
+#[expect(clippy::redundant_closure_for_method_calls, reason = "Burn does not export the type of the tensors")]
+pub(crate) fn record<B: Backend, C: CheckpointStrategy, O: Differentiable<B, N>, const N: usize>(
+    operation: O,
+    inputs: [FloatTensor<Autodiff<B, C>>; N],
+) -> FloatTensor<Autodiff<B, C>> {
+    let nodes = inputs.each_ref().map(|input| input.node());
+    let inputs = inputs.map(|input| input.into_primitive());
+    match Node::<O>(PhantomData).prepare::<C>(nodes).compute_bound().stateful() {
+        OpsKind::Tracked(prep) => {
+            let (output, saved) = operation.forward_saving(inputs);
+            prep.finish((operation, saved), output)
+        }
+        OpsKind::UnTracked(prep) => prep.finish(operation.forward(inputs)),
+    }
+}
+
+#[derive(Debug)]
+struct Node<O>(PhantomData<O>);
+
+impl<B: Backend, O: Differentiable<B, N>, const N: usize> Backward<B, N> for Node<O> {
+    type State = (O, O::Saved);
+
+    fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        let grad_output = grads.consume::<B>(&ops.node);
+        let needed = ops.parents.each_ref().map(Option::is_some);
+        let (operation, saved) = ops.state;
+        for (parent, gradient) in ops.parents.into_iter().zip(operation.gradients(saved, grad_output, needed)) {
+            if let (Some(node), Some(gradient)) = (parent, gradient) {
+                grads.register::<B>(node.id, gradient);
+            }
         }
     }
 }

@@ -1,17 +1,14 @@
 //! The transform of heads in camera-relative attention, by the camera and the patch of every token.
-// B scenes, N tokens, P parts of a row, H heads, E width of a head
 
-use burn::backend::autodiff::checkpoint::base::Checkpointer;
-use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::Dispatch;
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_extension};
-use burn::tensor::{Shape, Slice, Tensor, assert_shape};
-use clift_kernels::{HeadTransform, InstructionSet, transform_len};
+use burn::tensor::{Tensor, assert_shape};
+use clift_kernels::{HeadTransform, transform_len};
 
-use crate::ops::autodiff::register;
-use crate::ops::flex::{contiguous, is_native, values, values_mut};
+use crate::ops::autodiff::Differentiable;
+use crate::ops::backends::dispatch::operations;
+use crate::ops::composed::head_transform::Heads;
+use crate::ops::kernels::Kernels;
 
 /// Queries, keys and values side by side.
 pub(crate) const QUERY_KEY_VALUE: &[HeadTransform] = &[HeadTransform::Query, HeadTransform::Key, HeadTransform::Key];
@@ -21,13 +18,6 @@ pub(crate) const QUERY: &[HeadTransform] = &[HeadTransform::Query];
 pub(crate) const KEY_VALUE: &[HeadTransform] = &[HeadTransform::Key, HeadTransform::Key];
 /// Output of attention.
 pub(crate) const OUTPUT: &[HeadTransform] = &[HeadTransform::Output];
-
-/// Parts of a row with their transforms, and the number of heads of each part.
-#[derive(Clone, Copy, Debug)]
-pub struct Heads {
-    parts: &'static [HeadTransform],
-    num_heads: usize,
-}
 
 /// Transforms every head of tokens. Transforms are linear and have no gradient of their own.
 ///
@@ -49,134 +39,32 @@ pub(crate) fn transform_heads(
     ))
 }
 
-/// The operation of [`transform_heads`] on a backend.
-#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "wgpu"), Autodiff)]
-pub trait HeadTransformOps: Backend {
-    /// See [`transform_heads`].
-    fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self>;
-}
-
-/// The operation on a backend. The default implementation runs on every backend.
-pub trait HeadTransformKernels: Backend {
-    /// Transforms the heads of `x`, transposed for the gradient.
-    fn transform(
-        x: FloatTensor<Self>,
-        transforms: FloatTensor<Self>,
-        heads: Heads,
-        is_gradient: bool,
-    ) -> FloatTensor<Self> {
-        composed::<Self>(&x, &transforms, &heads.kinds(is_gradient), heads.num_heads)
+operations! {
+    /// The operation of [`transform_heads`] on a backend.
+    pub trait HeadTransformOps {
+        fn transform_heads(x, transforms; heads: Heads) = heads;
     }
 }
 
-impl Heads {
-    fn kinds(self, is_gradient: bool) -> Vec<HeadTransform> {
-        self.parts.iter().map(|kind| if is_gradient { kind.transposed() } else { *kind }).collect()
+impl<B: Kernels> Differentiable<B, 2> for Heads {
+    /// Transforms.
+    type Saved = FloatTensor<B>;
+
+    fn forward(&self, [x, transforms]: [FloatTensor<B>; 2]) -> FloatTensor<B> {
+        B::head_transform(x, transforms, *self, false)
     }
-}
 
-fn composed<B: Backend>(
-    x: &FloatTensor<B>,
-    transforms: &FloatTensor<B>,
-    parts: &[HeadTransform],
-    num_heads: usize,
-) -> FloatTensor<B> {
-    let shape = x.shape();
-    let [batch, count, width] = shape.dims();
-    let tokens = batch * count;
-    let part_width = width / parts.len();
-    let head_width = part_width / num_heads;
-    let (half, quarter) = (head_width / 2, head_width / 4);
-    let x = B::float_reshape(x.clone(), Shape::new([tokens, parts.len() * num_heads, head_width]));
-    let transforms = B::float_reshape(transforms.clone(), Shape::new([tokens, 1, transform_len(head_width)]));
-    let outputs = parts.iter().enumerate().map(|(part, kind)| {
-        let x = slice::<B>(&x, 1, part * num_heads, num_heads); // [BN, H, E]
-
-        let first = if kind.is_inverse() { 16 } else { 0 };
-        let matrix = B::float_reshape(slice::<B>(&transforms, 2, first, 16), Shape::new([tokens, 4, 4]));
-        let matrix = if kind.is_transposed() { B::float_swap_dims(matrix, 1, 2) } else { matrix };
-        let vectors = B::float_reshape(slice::<B>(&x, 2, 0, half), Shape::new([tokens, num_heads, 4, half / 4]));
-        let vectors =
-            B::float_reshape(B::float_permute(vectors, &[0, 2, 1, 3]), Shape::new([tokens, 4, num_heads * half / 4]));
-        let vectors = B::float_matmul(matrix, vectors); // [BN, 4, H E / 8]
-        let vectors = B::float_reshape(vectors, Shape::new([tokens, 4, num_heads, half / 4]));
-        let vectors = B::float_reshape(B::float_permute(vectors, &[0, 2, 1, 3]), Shape::new([tokens, num_heads, half]));
-
-        let cosine = slice::<B>(&transforms, 2, 32, quarter); // [BN, 1, E / 4]
-        let sine = B::float_mul_scalar(slice::<B>(&transforms, 2, 32 + quarter, quarter), kind.sign().into());
-        let (a, b) = (slice::<B>(&x, 2, half, quarter), slice::<B>(&x, 2, half + quarter, quarter));
-        let product = |x: &FloatTensor<B>, factor: &FloatTensor<B>| B::float_mul(x.clone(), factor.clone());
-        let first = B::float_sub(product(&a, &cosine), product(&b, &sine));
-        let second = B::float_add(product(&a, &sine), product(&b, &cosine));
-        B::float_cat(vec![vectors, first, second], 2)
-    });
-    B::float_reshape(B::float_cat(outputs.collect(), 1), shape)
-}
-
-/// Returns `len` entries of a dimension of `[a, b, c]`.
-fn slice<B: Backend>(x: &FloatTensor<B>, dim: usize, start: usize, len: usize) -> FloatTensor<B> {
-    let slices: Vec<Slice> =
-        (0..3).map(|i| if i == dim { Slice::from(start..start + len) } else { Slice::from(0..x.shape()[i]) }).collect();
-    B::float_slice(x.clone(), &slices)
-}
-
-impl HeadTransformKernels for Flex {
-    fn transform(
-        x: FloatTensor<Self>,
-        transforms: FloatTensor<Self>,
-        heads: Heads,
-        is_gradient: bool,
-    ) -> FloatTensor<Self> {
-        let kinds = heads.kinds(is_gradient);
-        if !is_native(&x) || !is_native(&transforms) {
-            return composed::<Self>(&x, &transforms, &kinds, heads.num_heads);
-        }
-        let head_width = x.shape()[2] / kinds.len() / heads.num_heads;
-        let mut x = contiguous(x);
-        let transforms = contiguous(transforms);
-        let sizes = [heads.num_heads, head_width];
-        let set = InstructionSet::detected();
-        clift_kernels::transform_heads(set, &kinds, sizes, values(&transforms), values_mut(&mut x));
-        x
+    fn forward_saving(&self, [x, transforms]: [FloatTensor<B>; 2]) -> (FloatTensor<B>, Self::Saved) {
+        (B::head_transform(x, transforms.clone(), *self, false), transforms)
     }
-}
 
-#[cfg(feature = "ndarray")]
-impl HeadTransformKernels for burn::backend::NdArray {}
-
-#[cfg(feature = "wgpu")]
-impl HeadTransformKernels for burn::backend::Cube {}
-
-impl<B: HeadTransformKernels> HeadTransformOps for B {
-    fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
-        Self::transform(x, transforms, heads, false)
-    }
-}
-
-impl<B: HeadTransformKernels, C: CheckpointStrategy> HeadTransformOps for Autodiff<B, C> {
-    fn transform_heads(x: FloatTensor<Self>, transforms: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
-        let (x, node) = x.into_parts();
-        let (transforms, _) = transforms.into_parts();
-        match TransformBackward.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let output = B::transform(x, transforms.clone(), heads, false);
-                prep.finish((transforms, heads), output)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::transform(x, transforms, heads, false)),
-        }
-    }
-}
-
-#[derive(Debug)]
-struct TransformBackward;
-
-impl<B: HeadTransformKernels> Backward<B, 1> for TransformBackward {
-    type State = (FloatTensor<B>, Heads);
-
-    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 1>(ops, grads, |(transforms, heads), grad_output, _| {
-            [Some(B::transform(grad_output, transforms, heads, true))]
-        });
+    fn gradients(
+        &self,
+        transforms: Self::Saved,
+        grad_output: FloatTensor<B>,
+        _needed: [bool; 2],
+    ) -> [Option<FloatTensor<B>>; 2] {
+        [Some(B::head_transform(grad_output, transforms, *self, true)), None]
     }
 }
 

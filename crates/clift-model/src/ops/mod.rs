@@ -1,30 +1,37 @@
-//! Operations with a hand-written backward: native kernels on `flex`, composed of Burn's operations on other backends.
+//! Operations with a hand-written backward, on every backend.
+//!
+//! An operation has a function on tensors and says what it saves for its backward. It computes by the methods of
+//! [`Kernels`](kernels::Kernels), which every backend implements: by native kernels, or, where it has none, by compositions of
+//! Burn's operations.
+//!
+//! Operations, each with its backward:
+//! - `linear`: linear layer, alone or fused with a preceding layer norm or GELU
+//! - `rms_norm`: RMS norms of the heads of queries and keys
+//! - `attention`: softmax attention
+//! - `cluster_attention`: attention inside clusters
+//! - `head_transform`: heads in the frame of a token's camera, for camera-relative attention
+//!
+//! Backends:
+//! - `kernels`: the trait
+//! - `composed`: its default implementations
+//! - `backends`: the implementation of each backend, a file each
 //!
 //! Shared parts:
-//! - `autodiff`: gradients of an operation for its inputs
-//! - `flex`: tensors of Burn's CPU backend as f32 slices
-//! - `mac_counter`: multiply-accumulates, counted in tests
+//! - `autodiff`: an operation as a node of the autodiff graph
 //! - `precision`: f32, bf16 or f16 operands of matrix products, per scope
-//! - `saved`: tensors that are saved for the backward, in bf16 where the precision is bf16
+//! - `mac_counter`: multiply-accumulates, counted in tests
 //!
-//! Operations:
-//! - `gelu`: GELU with exact gradient
-//! - `layer_norm`: layer normalization
-//! - `rms_norm`: RMS norms of the heads of queries and keys
-//! - `linear`: linear layer, alone or fused with a layer norm or GELU
-//! - `attention`: softmax attention
-//! - `cluster_attention`: attention inside clusters, linear in the number of tokens
-//! - `head_transform`: heads in the frame of a token's camera, for camera-relative attention
+//! CPU kernels on slices are in the crate `clift-kernels`. GPU kernels go into a crate beside it, `clift-cube`, on tensors of
+//! `CubeCL`; `backends/cube.rs` calls them. Today `CubeCL`'s own matrix product is all that it calls.
 
 pub(crate) mod attention;
 pub(crate) mod autodiff;
+pub(crate) mod backends;
 pub(crate) mod cluster_attention;
-pub(crate) mod flex;
-pub(crate) mod gelu;
+pub(crate) mod composed;
 pub(crate) mod head_transform;
-pub(crate) mod layer_norm;
+pub(crate) mod kernels;
 pub(crate) mod linear;
 pub(crate) mod mac_counter;
 pub(crate) mod precision;
 pub(crate) mod rms_norm;
-pub(crate) mod saved;

@@ -3,7 +3,7 @@
 //! Only the two operands of a product are rounded, in linear layers and attention, forward and backward. Weights, results,
 //! sums, norms, softmax, GELU, loss, gradients and optimizer state stay f32, as do the first layers, whose inputs are
 //! rays, and the attention inside clusters with its gates. In bf16, queries, keys, values and the input of GELU are also saved
-//! for the backward in bf16 ([`saved`](crate::ops::saved)).
+//! for the backward in bf16 ([`Kernels::save`](crate::ops::kernels::Kernels::save)).
 //!
 //! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
 //! forward pass. An operation reads the precision once; its backward uses that of its forward.
@@ -11,16 +11,13 @@
 use std::cell::Cell;
 use std::marker::PhantomData;
 
-use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Flex, TensorMetadata};
-use burn::tensor::{DType, Device, FloatDType, Tensor};
-use clift_kernels::{InstructionSet, OperandType, matmul_bf16, peak_flops};
+use burn::tensor::{DType, Device, Tensor};
+use clift_kernels::{InstructionSet, OperandType, peak_flops};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
 use crate::names::{names, parse};
-use crate::ops::flex::{matrix, stored_matrix, tensor};
 
 /// Type of the operands of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
@@ -143,57 +140,10 @@ impl Drop for PrecisionScope {
     }
 }
 
-/// Matrix products on a backend. The default implementations run on every backend.
-pub trait MatmulKernels: Backend {
-    /// Multiplies matrices; f32 operands are rounded to `precision`, operands of another type (f64, in tests) are not.
-    fn matmul(precision: Precision, lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
-        let precision = if lhs.dtype() == DType::F32 { precision } else { Precision::F32 };
-        match precision {
-            Precision::F32 => Self::float_matmul(lhs, rhs),
-            Precision::Bf16 => Self::matmul_bf16(lhs, rhs),
-            Precision::F16 => {
-                Self::matmul_f16(Self::float_cast(lhs, FloatDType::F16), Self::float_cast(rhs, FloatDType::F16))
-            }
-        }
-    }
-
-    /// Multiplies f32 matrices whose values it rounds to bf16, and returns f32.
-    fn matmul_bf16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
-        let [lhs, rhs] = [lhs, rhs].map(|x| Self::float_cast(Self::float_cast(x, FloatDType::BF16), FloatDType::F32));
-        Self::float_matmul(lhs, rhs)
-    }
-
-    /// Multiplies f16 matrices and returns f32; this implementation rounds the product to f16 first, as most backends do.
-    fn matmul_f16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
-        Self::float_cast(Self::float_matmul(lhs, rhs), FloatDType::F32)
-    }
-}
-
-impl MatmulKernels for Flex {
-    fn matmul_bf16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
-        let ([rows, inner], [_, columns]) = (lhs.shape().dims(), rhs.shape().dims());
-        let [lhs, rhs] = [lhs, rhs].map(stored_matrix);
-        let mut output = vec![0.0; rows * columns];
-        let factors = [matrix(&lhs), matrix(&rhs)];
-        matmul_bf16(InstructionSet::detected(), [rows, inner, columns], factors, None, &mut output);
-        tensor(output, [rows, columns])
-    }
-}
-#[cfg(feature = "ndarray")]
-impl MatmulKernels for burn::backend::NdArray {}
-#[cfg(feature = "wgpu")]
-impl MatmulKernels for burn::backend::Cube {
-    /// The kernels accumulate in f32 and write f32.
-    fn matmul_f16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
-        use burn_cubecl::kernel::matmul::{MatmulStrategy, matmul};
-        matmul(lhs, rhs, None, MatmulStrategy::default(), DType::F32).expect("f32 operands of these shapes multiply")
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{devices, random, to_vec};
+    use crate::testing::{devices, error_norms, random, to_vec};
 
     /// Devices with f16, and flex in bf16, which processors without the instructions emulate.
     fn reduced_precisions() -> impl Iterator<Item = (Device, Precision)> {
@@ -239,8 +189,8 @@ mod tests {
     }
 
     /// Returns output and gradients of a chain of all operations.
-    fn results(device: &Device, precision: Precision, dtype: DType) -> Vec<Vec<f64>> {
-        use crate::ops::attention::sdpa::{cross_sdpa, self_sdpa};
+    fn results(device: &Device, precision: Precision, dtype: DType) -> Vec<Tensor<1>> {
+        use crate::ops::attention::{cross_sdpa, self_sdpa};
         use crate::ops::linear::{gelu_linear, linear, norm_linear};
         use burn::module::Param;
         use burn::nn::{LayerNorm, LayerNormConfig, Linear};
@@ -274,9 +224,9 @@ mod tests {
         let gradient = |grad: Option<Tensor<2>>| {
             let grad = grad.expect("tracked");
             assert_eq!(grad.dtype(), dtype, "gradients are not f16");
-            to_vec(grad)
+            grad.flatten(0, 1)
         };
-        let mut all = vec![to_vec(output.inner())];
+        let mut all = vec![output.inner().flatten(0, 2)];
         all.push(gradient(x.grad(&grads).map(|grad| grad.flatten(0, 1))));
         all.extend(layers.iter().map(|layer| gradient(layer.weight.val().grad(&grads))));
         all
@@ -286,18 +236,16 @@ mod tests {
     fn errors_of_outputs_and_gradients_match_the_bits_of_the_operands() {
         let expected = results(&Device::flex(), Precision::F32, DType::F64);
         for precision in [Precision::Bf16, Precision::F16] {
-            assert_eq!(expected, results(&Device::flex(), precision, DType::F64), "f64 is not rounded");
+            let values = results(&Device::flex(), precision, DType::F64).into_iter().map(to_vec);
+            assert!(values.eq(expected.iter().cloned().map(to_vec)), "f64 is not rounded");
         }
-        let errors = |found: &[Vec<f64>]| -> Vec<f64> {
-            let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
-            let error = |(found, expected): (&Vec<f64>, &Vec<f64>)| {
-                norm(&mut found.iter().zip(expected).map(|(a, b)| a - b)) / norm(&mut expected.iter().copied())
-            };
-            found.iter().zip(&expected).map(error).collect()
+        let errors = |found: Vec<Tensor<1>>| -> Vec<f64> {
+            let pairs = found.into_iter().zip(expected.clone()).map(|(found, expected)| [found, expected]);
+            pairs.map(|pair| error_norms(&[pair])).map(|[difference, norm]| difference / norm).collect()
         };
         for (device, precision) in reduced_precisions() {
-            let f32 = errors(&results(&device, Precision::F32, DType::F32));
-            let reduced = errors(&results(&device, precision, DType::F32));
+            let f32 = errors(results(&device, Precision::F32, DType::F32));
+            let reduced = errors(results(&device, precision, DType::F32));
             // f16 has 13 bits less than f32, bf16 16; the error of few values varies widely. The weights are large: rounded
             // scores move the softmax.
             let (step, most) = if precision == Precision::F16 { (1.0, 3e-2) } else { (8.0, 4e-1) };
@@ -317,7 +265,7 @@ mod tests {
             let query = Tensor::<3>::full([1, 2, 4], 100.0, &device);
             let keys = query.clone().slice([0..1, 0..1, 0..4]);
             let output =
-                crate::ops::attention::sdpa::cross_sdpa(query, Tensor::cat(vec![keys.clone(), keys.ones_like()], 2), 1);
+                crate::ops::attention::cross_sdpa(query, Tensor::cat(vec![keys.clone(), keys.ones_like()], 2), 1);
             assert!(to_vec(output).iter().all(|value| (value - 1.0).abs() < 1e-3));
         }
     }

@@ -9,7 +9,7 @@ use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::tokens::Tokens;
-use crate::ops::attention::sdpa::{cross_sdpa, self_sdpa};
+use crate::ops::attention::{cross_sdpa, self_sdpa};
 use crate::ops::linear::{linear, norm_linear};
 
 /// Self-attention with a packed projection (paper section 3.1: eight heads).

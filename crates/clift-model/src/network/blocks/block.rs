@@ -11,7 +11,7 @@ use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::tokens::Tokens;
-use crate::ops::attention::sdpa::cross_sdpa;
+use crate::ops::attention::cross_sdpa;
 
 /// Self-attention and feed-forward network, each with a norm before and a residual connection.
 #[derive(Module, Debug)]

@@ -3,21 +3,16 @@
 //! Under autodiff, Burn's attention keeps about three score maps per head (13.5 GiB for one scene of 4,096 tokens). The
 //! operations here keep inputs and output and compute the scores again in the backward, a chunk of queries at a time, so
 //! that memory is linear in the number of tokens.
-// B scenes, Q queries, K keys, D width, H heads, E = D/H width of a head
 
-use burn::backend::autodiff::checkpoint::base::Checkpointer;
-use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::Dispatch;
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, backend_extension};
 use burn::tensor::{Tensor, assert_shape};
 
-use crate::ops::attention::backends::AttentionKernels;
-use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv};
-use crate::ops::autodiff::register;
+use crate::ops::autodiff::Differentiable;
+use crate::ops::backends::dispatch::operations;
+use crate::ops::composed::attention::{AttentionOutput, Qkv};
+use crate::ops::kernels::{HeadConfig, Kernels, SavedTensor};
 use crate::ops::mac_counter;
-use crate::ops::saved::Saved;
 
 /// Computes attention among the tokens of a scene, `softmax(q k^T / sqrt(head width)) v`, unmasked.
 ///
@@ -53,89 +48,88 @@ pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> T
     Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, HeadConfig::now(num_heads)))
 }
 
-/// The operations of [`self_sdpa`] and [`cross_sdpa`] on a backend.
-#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "wgpu"), Autodiff)]
-pub trait AttentionOps: Backend {
-    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
-}
-
-impl<B: AttentionKernels> AttentionOps for B {
-    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
-        Self::attend(&Qkv::Packed(query_key_value), heads).output
-    }
-
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
-        Self::attend(&Qkv::Separate { query, key_value }, heads).output
+operations! {
+    /// The operations of [`self_sdpa`] and [`cross_sdpa`] on a backend.
+    pub trait AttentionOps {
+        fn self_sdpa(query_key_value; heads: HeadConfig) = Sdpa(heads);
+        fn cross_sdpa(query, key_value; heads: HeadConfig) = Sdpa(heads);
     }
 }
 
-impl<B: AttentionKernels, C: CheckpointStrategy> AttentionOps for Autodiff<B, C> {
-    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
-        let (packed, node) = query_key_value.into_parts();
-        match SdpaBackward.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let state = attend::<B>(Qkv::Packed(packed), heads);
-                let output = state.attended.output.clone();
-                prep.finish(state, output)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::self_sdpa(packed, heads)),
-        }
-    }
+#[derive(Clone, Copy, Debug)]
+struct Sdpa(HeadConfig);
 
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
-        let ((query, query_node), (key_value, key_value_node)) = (query.into_parts(), key_value.into_parts());
-        match SdpaBackward.prepare::<C>([query_node, key_value_node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let state = attend::<B>(Qkv::Separate { query, key_value }, heads);
-                let output = state.attended.output.clone();
-                prep.finish(state, output)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::cross_sdpa(query, key_value, heads)),
-        }
-    }
-}
-
-#[derive(Debug)]
-struct SdpaBackward;
-
+/// Inputs and results of the forward pass.
 #[derive(Clone, Debug)]
-struct SdpaState<T> {
-    inputs: Qkv<Saved<T>>,
-    attended: AttentionOutput<T>,
-    heads: HeadConfig,
+struct SavedAttention<T> {
+    inputs: Qkv<SavedTensor<T>>,
+    results: AttentionOutput<T>,
 }
 
-impl<T> SdpaState<T> {
-    fn backward<B: AttentionKernels<FloatTensorPrimitive = T>>(self, grad_output: T) -> Qkv<T> {
-        B::attend_backward(self.inputs.map(B::restore), self.attended, self.heads, grad_output)
+impl Sdpa {
+    fn forward_saving<B: Kernels>(
+        self,
+        inputs: Qkv<FloatTensor<B>>,
+    ) -> (FloatTensor<B>, SavedAttention<FloatTensor<B>>) {
+        let results = B::attention_forward(&inputs, self.0);
+        let output = results.output.clone();
+        (output, SavedAttention { inputs: inputs.map(|x| B::save(self.0.precision, x)), results })
+    }
+
+    fn gradients<B: Kernels>(
+        self,
+        saved: SavedAttention<FloatTensor<B>>,
+        grad_output: FloatTensor<B>,
+    ) -> Qkv<FloatTensor<B>> {
+        B::attention_backward(saved.inputs.map(B::restore), saved.results, self.0, grad_output)
     }
 }
 
-fn attend<B: AttentionKernels>(inputs: Qkv<FloatTensor<B>>, heads: HeadConfig) -> SdpaState<FloatTensor<B>> {
-    let attended = B::attend(&inputs, heads);
-    SdpaState { inputs: inputs.map(|x| B::save(heads.precision, x)), attended, heads }
-}
+impl<B: Kernels> Differentiable<B, 1> for Sdpa {
+    type Saved = SavedAttention<FloatTensor<B>>;
 
-impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
-    type State = SdpaState<FloatTensor<B>>;
+    fn forward(&self, [packed]: [FloatTensor<B>; 1]) -> FloatTensor<B> {
+        B::attention_forward(&Qkv::Packed(packed), self.0).output
+    }
 
-    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 1>(ops, grads, |state, grad_output, _| match state.backward::<B>(grad_output) {
+    fn forward_saving(&self, [packed]: [FloatTensor<B>; 1]) -> (FloatTensor<B>, Self::Saved) {
+        Self::forward_saving::<B>(*self, Qkv::Packed(packed))
+    }
+
+    fn gradients(
+        &self,
+        saved: Self::Saved,
+        grad_output: FloatTensor<B>,
+        _needed: [bool; 1],
+    ) -> [Option<FloatTensor<B>>; 1] {
+        match Self::gradients::<B>(*self, saved, grad_output) {
             Qkv::Packed(grad) => [Some(grad)],
             Qkv::Separate { .. } => unreachable!("gradients have the layout of the inputs"),
-        });
+        }
     }
 }
 
-impl<B: AttentionKernels> Backward<B, 2> for SdpaBackward {
-    type State = SdpaState<FloatTensor<B>>;
+impl<B: Kernels> Differentiable<B, 2> for Sdpa {
+    type Saved = SavedAttention<FloatTensor<B>>;
 
-    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 2>(ops, grads, |state, grad_output, _| match state.backward::<B>(grad_output) {
+    fn forward(&self, [query, key_value]: [FloatTensor<B>; 2]) -> FloatTensor<B> {
+        B::attention_forward(&Qkv::Separate { query, key_value }, self.0).output
+    }
+
+    fn forward_saving(&self, [query, key_value]: [FloatTensor<B>; 2]) -> (FloatTensor<B>, Self::Saved) {
+        Self::forward_saving::<B>(*self, Qkv::Separate { query, key_value })
+    }
+
+    fn gradients(
+        &self,
+        saved: Self::Saved,
+        grad_output: FloatTensor<B>,
+        _needed: [bool; 2],
+    ) -> [Option<FloatTensor<B>>; 2] {
+        match Self::gradients::<B>(*self, saved, grad_output) {
             Qkv::Separate { query, key_value } => [Some(query), Some(key_value)],
             Qkv::Packed(_) => unreachable!("gradients have the layout of the inputs"),
-        });
+        }
     }
 }
 
@@ -144,9 +138,10 @@ mod tests {
     use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::ops::attention::composed::{MAX_SCORES, query_chunks};
+    use crate::ops::composed::attention::{MAX_SCORES, query_chunks};
     use crate::testing::{
-        Fixture, assert_close, check_gradients, check_native, cpu_devices, devices, output_and_gradients, random,
+        Fixture, assert_close, assert_finite, check_equal, check_gradients, check_native, cpu_devices, devices,
+        output_and_gradients, random,
     };
 
     fn sdpa(query: Tensor<3>, key: Tensor<3>, value: Tensor<3>, num_heads: usize) -> Tensor<3> {
@@ -189,7 +184,7 @@ mod tests {
     #[test]
     fn one_and_two_chunks_equal_plain_autodiff_in_f64() {
         assert_eq!(query_chunks(1, 8, 4096, 4096).len(), 8);
-        assert_eq!(query_chunks(1, 1, 3, MAX_SCORES * 2), [(0, 1), (1, 2), (2, 3)]);
+        assert_eq!(query_chunks(1, 1, 3, MAX_SCORES * 2), [0..1, 1..2, 2..3]);
         // 2 x 64 heads x 512 x 512 = 2^25 scores. All tensors are f64 and take the composed operation.
         let device = Device::flex();
         for (num_queries, num_keys, dim, num_heads, num_chunks) in [(5, 7, 8, 4, 1), (512, 512, 64, 64, 2)] {
@@ -197,14 +192,8 @@ mod tests {
             let inputs =
                 [(num_queries, 1), (num_keys, 2), (num_keys, 3)].map(|(n, seed)| random([2, n, dim], seed, &device));
             let cotangent = random([2, num_queries, dim], 4, &device);
-            let (output, grads) =
-                output_and_gradients(inputs.clone(), cotangent.clone(), |[q, k, v]| sdpa(q, k, v, num_heads));
-            let (plain_output, plain_grads) =
-                output_and_gradients(inputs, cotangent, |[q, k, v]| plain(q, k, v, num_heads));
-            assert_close(&output, &plain_output, 1e-12);
-            for (grad, plain_grad) in grads.iter().zip(&plain_grads) {
-                assert_close(grad, plain_grad, 1e-12);
-            }
+            let f = |[q, k, v]: [Tensor<3>; 3]| sdpa(q, k, v, num_heads);
+            check_equal(inputs, cotangent, f, |[q, k, v]| plain(q, k, v, num_heads), 1e-12);
         }
     }
 
@@ -251,7 +240,7 @@ mod tests {
             let ones = rows(&[1.0, 1.0]);
             let (output, grads) = output_and_gradients(inputs, ones.clone(), |[q, k, v]| sdpa(q, k, v, 1));
             assert_close(&output, &ones, 0.0);
-            assert!(grads.into_iter().all(|grad| grad.is_finite().all().into_scalar::<bool>()));
+            assert_finite(grads);
         }
     }
 

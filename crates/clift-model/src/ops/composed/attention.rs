@@ -1,23 +1,12 @@
 //! Attention in chunks of queries, on any backend.
 
+use std::ops::Range;
+
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, TensorMetadata};
-use burn::tensor::{Shape, Slice};
+use burn::tensor::Shape;
 
-use crate::ops::precision::{MatmulKernels, Precision};
-
-/// Number of heads and precision of an attention.
-#[derive(Clone, Copy, Debug)]
-pub struct HeadConfig {
-    pub(crate) num_heads: usize,
-    pub(crate) precision: Precision,
-}
-
-impl HeadConfig {
-    pub(crate) fn now(num_heads: usize) -> Self {
-        Self { num_heads, precision: Precision::current() }
-    }
-}
+use crate::ops::composed::primitives::{narrow, score_scale};
 
 /// Queries, keys and values, as the projections return them.
 #[derive(Clone, Debug)]
@@ -43,6 +32,7 @@ impl<T> Qkv<T> {
     }
 }
 
+/// Results of the forward pass of attention.
 #[derive(Clone, Debug)]
 pub struct AttentionOutput<T> {
     /// Output, `[B, Q, D]`.
@@ -54,9 +44,8 @@ pub struct AttentionOutput<T> {
 /// Splits into queries, keys and values, each `[B, N, D]`.
 fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
     let part = |packed: &FloatTensor<B>, parts: usize, part: usize| {
-        let [batch, count, width] = packed.shape().dims();
-        let dim = width / parts;
-        B::float_slice(packed.clone(), &[0..batch, 0..count, part * dim..(part + 1) * dim].map(Slice::from))
+        let dim = packed.shape()[2] / parts;
+        narrow::<B>(packed, 2, part * dim..(part + 1) * dim)
     };
     match inputs {
         Qkv::Packed(packed) => [0, 1, 2].map(|i| part(packed, 3, i)),
@@ -69,25 +58,26 @@ fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
 pub const MAX_SCORES: usize = 1 << 24;
 
 /// Divides the queries into ranges of at most [`MAX_SCORES`] scores each.
-pub(crate) fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: usize) -> Vec<(usize, usize)> {
+pub(crate) fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: usize) -> Vec<Range<usize>> {
     let chunk = (MAX_SCORES / (batch * num_heads * num_keys).max(1)).clamp(1, num_queries.max(1));
-    (0..num_queries).step_by(chunk).map(|start| (start, (start + chunk).min(num_queries))).collect()
+    (0..num_queries).step_by(chunk).map(|start| start..(start + chunk).min(num_queries)).collect()
 }
 
 /// Computes `softmax(s q k^T) v` per head, a chunk of queries at a time.
-pub(crate) fn composed_forward<B: MatmulKernels>(
+pub(crate) fn forward<B: Backend>(
     inputs: &Qkv<FloatTensor<B>>,
-    HeadConfig { num_heads, precision }: HeadConfig,
+    num_heads: usize,
+    matmul: impl Fn(FloatTensor<B>, FloatTensor<B>) -> FloatTensor<B>,
 ) -> AttentionOutput<FloatTensor<B>> {
     let [query, key, value] = split::<B>(inputs);
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
-    let query = split_heads::<B>(B::float_mul_scalar(query, scale(dim, num_heads).into()), num_heads);
+    let query = split_heads::<B>(B::float_mul_scalar(query, score_scale(dim, num_heads).into()), num_heads);
     let key_t = B::float_swap_dims(split_heads::<B>(key, num_heads), 2, 3); // [B, H, E, K]
     let value = split_heads::<B>(value, num_heads);
     let chunks = query_chunks(batch, num_heads, num_queries, num_keys).into_iter().map(|range| {
-        let scores = B::matmul(precision, rows::<B>(&query, range), key_t.clone()); // [B, H, chunk, K]
-        B::matmul(precision, B::softmax(scores, 3), value.clone())
+        let scores = matmul(narrow::<B>(&query, 2, range), key_t.clone()); // [B, H, chunk, K]
+        matmul(B::softmax(scores, 3), value.clone())
     });
     AttentionOutput { output: merge_heads::<B>(concat::<B>(chunks.collect())), log_sum: None }
 }
@@ -95,17 +85,18 @@ pub(crate) fn composed_forward<B: MatmulKernels>(
 /// Computes the gradients of the inputs, a chunk of queries at a time.
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`, `dK = s dS^T Q`.
-pub(crate) fn composed_backward<B: MatmulKernels>(
+pub(crate) fn backward<B: Backend>(
     inputs: &Qkv<FloatTensor<B>>,
     output: FloatTensor<B>,
-    HeadConfig { num_heads, precision }: HeadConfig,
+    num_heads: usize,
     grad_output: FloatTensor<B>,
+    matmul: impl Fn(FloatTensor<B>, FloatTensor<B>) -> FloatTensor<B>,
 ) -> Qkv<FloatTensor<B>> {
     let [query, key, value] = split::<B>(inputs);
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let head_width = dim / num_heads;
-    let scale = scale(dim, num_heads);
+    let scale = score_scale(dim, num_heads);
 
     // rowsum(dO * O) per head: [B, H, Q, 1]
     let delta = B::float_reshape(
@@ -122,15 +113,15 @@ pub(crate) fn composed_backward<B: MatmulKernels>(
     let mut grad_query = Vec::new();
     let mut grad_key_value: Option<(FloatTensor<B>, FloatTensor<B>)> = None;
     for range in query_chunks(batch, num_heads, num_queries, num_keys) {
-        let query = rows::<B>(&query, range);
-        let grad_output = rows::<B>(&grad_output, range);
-        let weights = B::softmax(B::matmul(precision, query.clone(), key_t.clone()), 3);
-        let grad_weights = B::matmul(precision, grad_output.clone(), value_t.clone());
-        let grad_scores = B::float_mul(weights.clone(), B::float_sub(grad_weights, rows::<B>(&delta, range)));
-        let grad_value = B::matmul(precision, B::float_swap_dims(weights, 2, 3), grad_output);
+        let query = narrow::<B>(&query, 2, range.clone());
+        let grad_output = narrow::<B>(&grad_output, 2, range.clone());
+        let weights = B::softmax(matmul(query.clone(), key_t.clone()), 3);
+        let grad_weights = matmul(grad_output.clone(), value_t.clone());
+        let grad_scores = B::float_mul(weights.clone(), B::float_sub(grad_weights, narrow::<B>(&delta, 2, range)));
+        let grad_value = matmul(B::float_swap_dims(weights, 2, 3), grad_output);
         // The query is already scaled.
-        let grad_key = B::matmul(precision, B::float_swap_dims(grad_scores.clone(), 2, 3), query);
-        grad_query.push(B::matmul(precision, grad_scores, key.clone()));
+        let grad_key = matmul(B::float_swap_dims(grad_scores.clone(), 2, 3), query);
+        grad_query.push(matmul(grad_scores, key.clone()));
         grad_key_value = Some(match grad_key_value {
             None => (grad_key, grad_value),
             Some((key_sum, value_sum)) => (B::float_add(key_sum, grad_key), B::float_add(value_sum, grad_value)),
@@ -147,10 +138,6 @@ pub(crate) fn composed_backward<B: MatmulKernels>(
     }
 }
 
-fn scale(dim: usize, num_heads: usize) -> f64 {
-    1.0 / ((dim / num_heads) as f64).sqrt()
-}
-
 /// `[B, N, D] -> [B, H, N, E]`
 fn split_heads<B: Backend>(x: FloatTensor<B>, num_heads: usize) -> FloatTensor<B> {
     let [batch, count, dim] = x.shape().dims();
@@ -161,15 +148,6 @@ fn split_heads<B: Backend>(x: FloatTensor<B>, num_heads: usize) -> FloatTensor<B
 fn merge_heads<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     let [batch, num_heads, count, head_width] = x.shape().dims();
     B::float_reshape(B::float_swap_dims(x, 1, 2), Shape::new([batch, count, num_heads * head_width]))
-}
-
-/// Returns rows `start..end` of every head.
-fn rows<B: Backend>(x: &FloatTensor<B>, (start, end): (usize, usize)) -> FloatTensor<B> {
-    let [batch, num_heads, count, width] = x.shape().dims();
-    if (start, end) == (0, count) {
-        return x.clone();
-    }
-    B::float_slice(x.clone(), &[0..batch, 0..num_heads, start..end, 0..width].map(Slice::from))
 }
 
 fn concat<B: Backend>(mut chunks: Vec<FloatTensor<B>>) -> FloatTensor<B> {

@@ -1,0 +1,14 @@
+//! The implementations of [`Kernels`](crate::ops::kernels::Kernels), and the list of backends.
+//!
+//! - `dispatch`: the list: an operation runs on the backend of its tensors
+//! - `flex`: Burn's CPU backend, by the kernels of `clift-kernels` in f32 and bf16
+//! - `flex_slices`: its tensors as f32 slices
+//! - `cube`: GPUs
+//!
+//! `NdArray` computes by the default implementations; `dispatch` has the line.
+
+#[cfg(feature = "wgpu")]
+pub(crate) mod cube;
+pub(crate) mod dispatch;
+pub(crate) mod flex;
+pub(crate) mod flex_slices;
