@@ -88,7 +88,7 @@ pub use tools::check::result::{FrameCheck, PairCheck, SceneCheck, Verdict};
 pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, skipped_scenes};
 pub use tools::checksums::hash_file;
 pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
-pub use tools::export::{ImageEncoding, read_scene, write_evaluation_index, write_source};
+pub use tools::export::{ImageEncoding, read_scene, write_evaluation_index};
 pub use tools::index_statistics::IndexStatistics;
 pub use tools::info::SourceInfo;
 pub use tools::overlap_index::{OverlapOptions, write_overlap_index};

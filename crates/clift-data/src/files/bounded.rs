@@ -24,6 +24,14 @@ pub(crate) fn read_bounded(path: &Path, limit: u64, action: &'static str) -> Res
     Ok(bytes)
 }
 
+/// Reads the first `limit` bytes of a regular file; `None` for other objects and unreadable files.
+pub(crate) fn read_start(path: &Path, limit: u64) -> Option<Vec<u8>> {
+    let mut start = Vec::new();
+    std::fs::metadata(path).ok()?.is_file().then_some(())?;
+    std::fs::File::open(path).ok()?.take(limit).read_to_end(&mut start).ok()?;
+    Some(start)
+}
+
 /// Parses JSON. A byte order mark in front, which editors on Windows write, is skipped.
 pub(crate) fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, serde_json::Error> {
     serde_json::from_slice(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))

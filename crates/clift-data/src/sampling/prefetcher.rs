@@ -1,8 +1,9 @@
 //! Items made ahead by background threads, delivered in step order.
 
-use std::collections::BTreeMap;
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::JoinHandle;
 
 use crate::error::WorkerPanic;
@@ -16,30 +17,18 @@ type Make<T, E> = dyn Fn(u64) -> Result<T, E> + Send + Sync;
 /// [`WorkerPanic`]), are delivered at their step; iteration may continue. Dropping the iterator waits for the items in
 /// progress, at most one per thread.
 pub struct Prefetcher<T, E> {
-    shared: Arc<Shared<T, E>>,
-    workers: Vec<JoinHandle<()>>,
-    next_step: u64,
+    make: Arc<Make<T, E>>,
+    start_step: u64,
+    /// Steps that have not been taken.
+    steps: Range<u64>,
+    /// Lane `i` of `n` makes the steps `start_step + i`, `start_step + i + n`, ..; `None` makes them when they are taken.
+    lanes: Vec<Option<Lane<T, E>>>,
 }
 
-struct Shared<T, E> {
-    make: Box<Make<T, E>>,
-    end_step: u64,
-    depth: u64,
-    queue: Mutex<Queue<T, E>>,
-    /// Signalled when an item is finished.
-    finished: Condvar,
-    /// Signalled when an item is taken, and at shutdown.
-    taken: Condvar,
-}
-
-struct Queue<T, E> {
-    /// Finished items by step.
-    items: BTreeMap<u64, Result<T, E>>,
-    /// First step that no thread has started.
-    unstarted: u64,
-    /// Next step of the consumer.
-    consumed: u64,
-    closed: bool,
+/// A thread and its finished items, in step order.
+struct Lane<T, E> {
+    items: Receiver<Result<T, E>>,
+    worker: JoinHandle<()>,
 }
 
 impl<T, E> Prefetcher<T, E>
@@ -50,7 +39,7 @@ where
     /// Starts to compute the items of `start_step..end_step`.
     ///
     /// With `threads = 0`, `make` runs in the iterating thread. `depth`, at least 1, bounds the items in memory and the
-    /// number of threads. If the operating system refuses a thread, the others compute the same items.
+    /// number of threads. The iterating thread computes the items of a thread that the operating system refuses.
     pub fn new(
         make: impl Fn(u64) -> Result<T, E> + Send + Sync + 'static,
         start_step: u64,
@@ -58,23 +47,23 @@ where
         threads: usize,
         depth: usize,
     ) -> Self {
+        let make: Arc<Make<T, E>> = Arc::new(make);
         let depth = depth.max(1);
-        let queue = Queue { items: BTreeMap::new(), unstarted: start_step, consumed: start_step, closed: false };
-        let shared = Arc::new(Shared {
-            make: Box::new(make),
-            end_step,
-            depth: depth as u64,
-            queue: Mutex::new(queue),
-            finished: Condvar::new(),
-            taken: Condvar::new(),
-        });
-        let workers = (0..threads.min(depth))
-            .filter_map(|_| {
-                let shared = Arc::clone(&shared);
-                std::thread::Builder::new().name("clift-loader".into()).spawn(move || shared.run_worker()).ok()
-            })
-            .collect();
-        Self { shared, workers, next_step: start_step }
+        let num_lanes = threads.clamp(1, depth);
+        let lane = |index: usize| {
+            let make = Arc::clone(&make);
+            // A lane has one item in progress and the others of its share of `depth` in the channel.
+            let (sender, items) = sync_channel((depth - 1 - index) / num_lanes);
+            let run = move || {
+                let steps = (start_step.saturating_add(index as u64)..end_step).step_by(num_lanes);
+                // Ends when the iterator is dropped, which closes the channel.
+                steps.map(|step| make_caught(&*make, step)).try_for_each(|item| sender.send(item).ok());
+            };
+            let worker = std::thread::Builder::new().name("clift-loader".into()).spawn(run).ok()?;
+            Some(Lane { items, worker })
+        };
+        let lanes = (0..num_lanes).map(|index| (threads > 0).then(|| lane(index)).flatten()).collect();
+        Self { make, start_step, steps: start_step..end_step, lanes }
     }
 }
 
@@ -82,70 +71,30 @@ impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {
     type Item = Result<T, E>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let step = self.next_step;
-        if step >= self.shared.end_step {
-            return None;
-        }
-        self.next_step += 1;
-        if self.workers.is_empty() {
-            return Some(self.shared.make_caught(step));
-        }
-        let mut queue = self.shared.lock();
-        loop {
-            if let Some(item) = queue.items.remove(&step) {
-                queue.consumed = self.next_step;
-                self.shared.taken.notify_all();
-                return Some(item);
-            }
-            queue = self.shared.finished.wait(queue).unwrap_or_else(PoisonError::into_inner);
-        }
+        let step = self.steps.next()?;
+        let lane = (step - self.start_step) % self.lanes.len() as u64;
+        let made = self.lanes[lane as usize].as_ref().and_then(|lane| lane.items.recv().ok());
+        Some(made.unwrap_or_else(|| make_caught(&*self.make, step)))
     }
 }
 
-impl<T, E: From<WorkerPanic>> Shared<T, E> {
-    /// Computes the next step while fewer than `depth` items are waiting, until the end or shutdown.
-    fn run_worker(&self) {
-        let mut queue = self.lock();
-        while !queue.closed && queue.unstarted < self.end_step {
-            if queue.unstarted >= queue.consumed.saturating_add(self.depth) {
-                queue = self.taken.wait(queue).unwrap_or_else(PoisonError::into_inner);
-                continue;
-            }
-            let step = queue.unstarted;
-            queue.unstarted += 1;
-            drop(queue);
-            let item = self.make_caught(step);
-            queue = self.lock();
-            queue.items.insert(step, item);
-            self.finished.notify_all();
-        }
-    }
-
-    fn make_caught(&self, step: u64) -> Result<T, E> {
-        // `make` is shared behind `&`, and a partial result is discarded: no inconsistent state is visible.
-        catch_unwind(AssertUnwindSafe(|| (self.make)(step))).unwrap_or_else(|panic| {
-            let message = panic
-                .downcast_ref::<&str>()
-                .map(ToString::to_string)
-                .or_else(|| panic.downcast_ref::<String>().cloned())
-                .unwrap_or_else(|| "no message".into());
-            Err(WorkerPanic { step, message }.into())
-        })
-    }
-}
-
-impl<T, E> Shared<T, E> {
-    /// Locks the queue. No user code runs under the lock, so even a poisoned queue is consistent.
-    fn lock(&self) -> MutexGuard<'_, Queue<T, E>> {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
-    }
+fn make_caught<T, E: From<WorkerPanic>>(make: &Make<T, E>, step: u64) -> Result<T, E> {
+    // `make` is shared behind `&`, and a partial result is discarded: no inconsistent state is visible.
+    catch_unwind(AssertUnwindSafe(|| make(step))).unwrap_or_else(|panic| {
+        let message = panic
+            .downcast_ref::<&str>()
+            .map(ToString::to_string)
+            .or_else(|| panic.downcast_ref::<String>().cloned())
+            .unwrap_or_else(|| "no message".into());
+        Err(WorkerPanic { step, message }.into())
+    })
 }
 
 impl<T, E> Drop for Prefetcher<T, E> {
     fn drop(&mut self) {
-        self.shared.lock().closed = true;
-        self.shared.taken.notify_all();
-        for worker in self.workers.drain(..) {
+        // All channels are closed before the first thread is awaited.
+        let workers: Vec<JoinHandle<()>> = self.lanes.drain(..).flatten().map(|lane| lane.worker).collect();
+        for worker in workers {
             // A worker catches panics of `make`; a failed join leaves nothing to clean up.
             let _ = worker.join();
         }
@@ -190,18 +139,12 @@ mod tests {
 
     #[test]
     fn items_are_in_step_order_with_any_number_of_threads() {
-        let expected: Vec<_> = (17..60).map(|step| Ok(step * step)).collect();
-        for (threads, depth) in [(0, 1), (1, 1), (1, 4), (3, 2), (3, 8), (3, 0)] {
-            let items = within_seconds(move || squares(17, 60, threads, depth).collect::<Vec<_>>());
-            assert_eq!(items, expected, "{threads} threads, depth {depth}");
-        }
-    }
-
-    #[test]
-    fn empty_range_has_no_items() {
-        for threads in [0, 2] {
-            assert_eq!(squares(5, 5, threads, 2).count(), 0);
-            assert_eq!(squares(6, 5, threads, 2).count(), 0);
+        for (start, end) in [(17, 60), (5, 5), (6, 5)] {
+            let expected: Vec<_> = (start..end).map(|step| Ok(step * step)).collect();
+            for (threads, depth) in [(0, 1), (1, 1), (1, 4), (3, 2), (3, 8), (3, 0)] {
+                let items = within_seconds(move || squares(start, end, threads, depth).collect::<Vec<_>>());
+                assert_eq!(items, expected, "{threads} threads, depth {depth}");
+            }
         }
     }
 

@@ -1,5 +1,6 @@
 //! Samples the context and target frames of a training item.
 
+use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
@@ -137,7 +138,7 @@ impl ViewSampler {
         if !self.inner.needs_centres() {
             return self.sample_frames(source.num_frames(scene)?, &[], step, num_context, rng);
         }
-        let centres: Vec<_> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation.to_array()).collect();
+        let centres: Vec<DVec3> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation).collect();
         self.sample_frames(centres.len(), &centres, step, num_context, rng)
     }
 
@@ -149,7 +150,7 @@ impl ViewSampler {
     pub(crate) fn sample_frames(
         &self,
         num_frames: usize,
-        centres: &[[f64; 3]],
+        centres: &[DVec3],
         step: u64,
         num_context: usize,
         rng: &mut impl Rng,

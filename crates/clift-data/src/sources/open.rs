@@ -19,7 +19,7 @@ use crate::sources::photos::photo::PhotoOptions;
 use crate::sources::photos::photo_source::{PhotoSource, PhotoSourceOptions};
 use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder};
 use crate::sources::subset::SceneSubset;
-use crate::sources::test_scenes::{KEPT_AND_ABSENT, TestScenes};
+use crate::sources::test_scenes::TestScenes;
 
 /// Image folders of DL3DV scenes, by preference: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
@@ -111,7 +111,7 @@ impl SplitFolder<'_> {
             index_of_files(&self.base, &mut report)?
         };
         let keys: Vec<String> = index.keys().cloned().collect();
-        let kept = self.divide(list, &keys, options, &mut report);
+        let kept = self.divide(list, &keys, &mut report);
         let kept: HashSet<&str> =
             keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
         let is_kept = |key: &str| kept.contains(key);
@@ -138,7 +138,7 @@ impl SplitFolder<'_> {
     ) -> Result<Opened, DataError> {
         let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
-        let mut kept = self.divide(list, &keys, options, &mut report).into_iter();
+        let mut kept = self.divide(list, &keys, &mut report).into_iter();
         scenes.retain(|_| kept.next().unwrap_or_default());
         let is_dl3dv = kind == SourceKind::Dl3dv;
         let files = &options.files;
@@ -184,35 +184,10 @@ impl SplitFolder<'_> {
     }
 
     /// Returns which of the keys belong to the split; adds the others to the report.
-    fn divide(
-        &self,
-        list: Option<&TestScenes>,
-        keys: &[String],
-        options: &SourceOptions,
-        report: &mut SkipReport,
-    ) -> Vec<bool> {
+    fn divide(&self, list: Option<&TestScenes>, keys: &[String], report: &mut SkipReport) -> Vec<bool> {
         let Some(list) = list else { return vec![true; keys.len()] };
-        let (kept, mut divided) = list.divide(keys, self.split, !self.root.has_splits);
-        if self.root.has_splits && self.split == Split::Train && !divided.skips.is_empty() {
-            let in_test = TestScenes::of_keys(&self.test_keys(options).unwrap_or_default());
-            let absent = divided.skips.iter_mut().filter(|skip| !in_test.contains(&skip.key));
-            absent.for_each(|skip| skip.reason = KEPT_AND_ABSENT.into());
-        }
+        let (kept, divided) = list.divide(keys, self.split, !self.root.has_splits);
         report.append(divided);
         kept
-    }
-
-    fn test_keys(&self, options: &SourceOptions) -> Result<Vec<String>, DataError> {
-        let folder = SplitFolder::find(self.root, Split::Test)?;
-        Ok(match folder.detect(options.kind)? {
-            DetectedSource::Torch(SourceKind::Chunks) => {
-                read_index(&folder.base.join("index.json"))?.into_keys().collect()
-            }
-            DetectedSource::Torch(_) => index_of_files(&folder.base, &mut SkipReport::default())?.into_keys().collect(),
-            DetectedSource::Photos(_, scenes, _) => {
-                let scenes = if scenes.is_empty() { folder.re10k_clips(options)? } else { scenes };
-                scenes.into_iter().map(|scene| scene.key).collect()
-            }
-        })
     }
 }

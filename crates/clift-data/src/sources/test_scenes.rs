@@ -15,8 +15,6 @@ use crate::sources::keys::{last_name, plain_key};
 const MAX_BYTES: u64 = 256 << 20;
 /// Reason of skipping a test scene in the training split; no fault of the scene.
 pub const KEPT_FOR_TESTING: &str = "kept for testing";
-/// Reason of skipping a listed scene that lies only in `train/`: no split has it. Starts with [`KEPT_FOR_TESTING`].
-pub(crate) const KEPT_AND_ABSENT: &str = "kept for testing by the list of test scenes, but not in test/";
 
 /// Keys of the test scenes, without the prefix of DepthSplat; for DL3DV scenes, without their path.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -43,11 +41,7 @@ impl TestScenes {
             Some('[') => serde_json::from_str(text).map_err(json)?,
             _ => text.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect(),
         };
-        Ok(Self::of_keys(&keys))
-    }
-
-    pub(crate) fn of_keys(keys: &[String]) -> Self {
-        Self { keys: keys.iter().map(|key| plain_key(key).to_owned()).collect() }
+        Ok(Self { keys: keys.iter().map(|key| plain_key(key).to_owned()).collect() })
     }
 
     /// Returns whether the list contains a scene, by its key with or without the prefix of DepthSplat, or by the last part

@@ -3,10 +3,9 @@
 //! - `config`: options of synthetic scenes
 //! - `room`: a room, its objects and lamp
 //! - `camera_path`: the camera's arc through a room
-//! - `texture`: procedural surface colours
 //! - `ray_tracer`: small deterministic ray tracer
 //! - `real`: scenes with the statistics of photos
-//! - `tracing`: solids, patterns and light of `real`
+//! - `tracing`: patterns of surfaces; solids and light of `real`
 //! - `source`: scenes from seeds as a source
 
 pub(crate) mod camera_path;
@@ -15,5 +14,4 @@ pub(crate) mod ray_tracer;
 pub(crate) mod real;
 pub(crate) mod room;
 pub(crate) mod source;
-pub(crate) mod texture;
 pub(crate) mod tracing;

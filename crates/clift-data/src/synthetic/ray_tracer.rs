@@ -9,6 +9,7 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::synthetic::room::{Object, Room, Shape, turned};
 use crate::synthetic::tracing::noise::smooth;
+use crate::synthetic::tracing::surface::Surface;
 
 /// Smallest absolute slope of a slab test; keeps the test finite for rays along an axis.
 const LEAST_SLOPE: f32 = 1e-6;
@@ -31,6 +32,12 @@ struct Hit {
     gloss: f32,
     /// Index of the object in the room; `None` for a wall.
     object: Option<usize>,
+}
+
+impl Hit {
+    fn new(point: Vec3, normal: Vec3, surface: &Surface, [u, v]: [f32; 2], object: Option<usize>) -> Self {
+        Self { point, normal, albedo: surface.color(u, v, 0.0), gloss: surface.gloss, object }
+    }
 }
 
 /// Renders `room` with `side * side` rays per pixel. `specular` in `[0, 1]` scales all light that depends on the view.
@@ -107,8 +114,8 @@ fn nearest(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     let (distance, normal, object) = best;
     if let Some(index) = object {
         let (point, object) = (origin + direction * distance, &room.objects[index]);
-        let [u, v] = surface(object, point, normal);
-        return Hit { point, normal, albedo: object.texture.color(u, v), gloss: object.gloss, object: Some(index) };
+        let [u, v] = coordinates(object, point, normal);
+        return Hit::new(point, normal, &object.surface, [u, v], Some(index));
     }
     meet_room(room, origin, direction)
 }
@@ -157,8 +164,8 @@ fn steep(slope: f32) -> f32 {
     if slope.abs() < LEAST_SLOPE { LEAST_SLOPE.copysign(slope) } else { slope }
 }
 
-/// Returns the texture coordinates of a point on an object: the coordinates along the face in the object's frame.
-fn surface(object: &Object, point: Vec3, normal: Vec3) -> [f32; 2] {
+/// Returns the coordinates of a point on an object along its surface, in the object's frame.
+fn coordinates(object: &Object, point: Vec3, normal: Vec3) -> [f32; 2] {
     let local = point - object.center;
     let Shape::Block { turn, .. } = object.shape else { return [local.x + local.z, local.y] };
     let (Vec3 { x, y, z }, facing) = (turned(local, turn), turned(normal, turn));
@@ -187,9 +194,7 @@ fn meet_room(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     normal[axis] = if forward { -1.0 } else { 1.0 };
     let [x, y, z] = point.to_array();
     let [u, v] = [[z, y], [x, z], [x, y]][axis];
-    let albedo = room.walls[axis * 2 + usize::from(forward)].color(u, v);
-    let is_floor = axis == 1 && forward;
-    Hit { point, normal, albedo, gloss: if is_floor { 0.35 } else { 0.0 }, object: None }
+    Hit::new(point, normal, &room.walls[axis * 2 + usize::from(forward)], [u, v], None)
 }
 
 /// Returns the visible share of the lamp: 1 without shadow, 0 in full shadow.
@@ -257,7 +262,6 @@ mod tests {
     use super::*;
     use crate::random::step_rng;
     use crate::synthetic::config::SyntheticConfig;
-    use crate::synthetic::texture::Texture;
 
     const RED: Vec3 = Vec3::new(1.0, 0.0, 0.0);
 
@@ -265,10 +269,10 @@ mod tests {
     fn room_with_ball(walls: Vec3, ball: Vec3, gloss: f32) -> Room {
         let config = SyntheticConfig { num_objects: [0, 0], ..Default::default() };
         let mut room = Room::sample(&mut step_rng(5, 0, "test"), &config);
-        room.walls = [(); 6].map(|()| Texture::plain(walls));
+        room.walls = [(); 6].map(|()| Surface::plain(walls));
         let shape = Shape::Ball { radius: 0.2 };
         let center = Vec3::new(0.1, 0.2, -0.1);
-        room.objects.push(Object { shape, center, texture: Texture::plain(ball), gloss });
+        room.objects.push(Object { shape, center, surface: Surface { gloss, ..Surface::plain(ball) } });
         room
     }
 
@@ -334,7 +338,7 @@ mod tests {
         let turn = [0.6, 0.8];
         let half_size = Vec3::new(0.3, 0.2, 0.1);
         let shape = Shape::Block { half_size, turn };
-        let object = Object { shape, center: Vec3::new(1.0, 0.0, 2.0), texture: Texture::plain(RED), gloss: 0.0 };
+        let object = Object { shape, center: Vec3::new(1.0, 0.0, 2.0), surface: Surface::plain(RED) };
         for axis in 0..3 {
             let mut local = Vec3::ZERO;
             local[axis] = 1.0;

@@ -1,13 +1,15 @@
 //! A room: box-shaped walls, boxes and balls on the floor, a lamp and a camera path.
 
+use std::f32::consts::TAU;
+
 use glam::{DVec3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::random::{uniform_01, uniform_between};
+use crate::random::{uniform_01, uniform_below, uniform_between};
 use crate::synthetic::camera_path::{CLEARANCE, CameraPath};
 use crate::synthetic::config::SyntheticConfig;
-use crate::synthetic::texture::Texture;
+use crate::synthetic::tracing::surface::{Pattern, Surface, Wave, linear_color};
 
 /// Attempts to place an object, each 4 % smaller, before the room counts as full.
 const MAX_PLACEMENTS: u32 = 60;
@@ -23,9 +25,7 @@ pub(crate) enum Shape {
 pub(crate) struct Object {
     pub shape: Shape,
     pub center: Vec3,
-    pub texture: Texture,
-    /// 0 is matt, 1 is polished.
-    pub gloss: f32,
+    pub surface: Surface,
 }
 
 impl Object {
@@ -42,8 +42,8 @@ impl Object {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Room {
     pub half_size: Vec3,
-    /// Textures at -x, +x, -y (ceiling), +y (floor), -z, +z.
-    pub walls: [Texture; 6],
+    /// Surfaces at -x, +x, -y (ceiling), +y (floor), -z, +z.
+    pub walls: [Surface; 6],
     pub objects: Vec<Object>,
     pub lamp: Vec3,
     pub path: CameraPath,
@@ -74,7 +74,8 @@ impl Room {
                     (hue + quarter, 0.5 + 0.3 * uniform_01(rng), value, frequency)
                 }
             };
-            Texture::sample(rng, hue, saturation, value, frequency)
+            let gloss = if side == 3 { 0.35 } else { 0.0 };
+            Surface { gloss, ..sample_surface(rng, hue, saturation, value, frequency) }
         });
         let mut room = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
         let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
@@ -90,7 +91,7 @@ impl Room {
         let scale = config.room_half_size[0] * 0.96_f64.powi(attempt as i32);
         let mut size = |low: f64, high: f64| (scale * (low + (high - low) * uniform_01(rng))) as f32;
         let (radius, edges) = (size(0.13, 0.26), [size(0.1, 0.2), size(0.1, 0.34), size(0.1, 0.2)]);
-        let (sin, cos) = (uniform_01(rng) as f32 * std::f32::consts::TAU).sin_cos();
+        let (sin, cos) = (uniform_01(rng) as f32 * TAU).sin_cos();
         let is_ball = uniform_01(rng) < 0.5;
         let (shape, height) = if is_ball {
             (Shape::Ball { radius }, radius)
@@ -100,8 +101,8 @@ impl Room {
         let Vec3 { x: wide, y: floor, z: deep } = self.half_size;
         let center = Vec3::new(wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32);
         let hue = uniform_01(rng);
-        let texture = Texture::sample(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
-        let object = Object { shape, center, texture, gloss: uniform_01(rng) as f32 };
+        let surface = sample_surface(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
+        let object = Object { shape, center, surface: Surface { gloss: uniform_01(rng) as f32, ..surface } };
         self.has_room_for(&object).then_some(object)
     }
 
@@ -118,6 +119,20 @@ impl Room {
             .all(|other| (x - other.center.x).hypot(z - other.center.z) > reach + other.reach() + 0.02);
         off_path && inside && apart
     }
+}
+
+/// Samples a matt surface around `hue` (in turns), with about `frequency` cycles per unit of length. `saturation` and `value`
+/// describe the brighter colour.
+fn sample_surface(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Surface {
+    let wave = [Wave::Gradient, Wave::Stripes, Wave::Checkers, Wave::Ripples][uniform_below(rng, 4)];
+    let turn = uniform_01(rng) * std::f64::consts::TAU;
+    let shift = 0.12 + 0.3 * uniform_01(rng);
+    let darker = value * (0.25 + 0.15 * uniform_01(rng));
+    let rate = TAU * (frequency * (0.7 + 0.6 * uniform_01(rng))) as f32;
+    let phase = uniform_01(rng) as f32 * TAU;
+    let mut surface = Surface::plain(linear_color(hue, saturation, value));
+    surface.colors[1] = linear_color(hue + shift, saturation, darker);
+    Surface { pattern: Pattern::Waves { wave, phase }, turn: [turn.cos() as f32, turn.sin() as f32], rate, ..surface }
 }
 
 /// Rotates a vector about the vertical axis by (cosine, sine).

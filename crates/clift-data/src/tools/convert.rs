@@ -11,7 +11,6 @@ use crate::files::listing::has_ending;
 use crate::image::codec::check_encoded;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, note_on};
-use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::chunks::writer::{ChunkFill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
@@ -125,7 +124,6 @@ pub struct Converter<'a> {
     /// Complete scenes that were skipped when the source was opened.
     unreadable: BTreeSet<String>,
     pending: Vec<SceneRecord>,
-    pending_keys: HashSet<String>,
     fill: ChunkFill,
     report: ConversionReport,
 }
@@ -151,7 +149,6 @@ impl<'a> Converter<'a> {
             stale: BTreeSet::new(),
             unreadable: BTreeSet::new(),
             pending: Vec::new(),
-            pending_keys: HashSet::new(),
             fill: ChunkFill::default(),
             report: ConversionReport { skipped: skipped.clone(), ..ConversionReport::default() },
         };
@@ -162,7 +159,7 @@ impl<'a> Converter<'a> {
     /// Compares the scenes of the complete files with the source.
     fn scan(&mut self) -> Result<(), DataError> {
         // Scenes reserved for testing are readable.
-        let unreadable = self.report.skipped.skips.iter().filter(|skip| !skip.reason.starts_with(KEPT_FOR_TESTING));
+        let unreadable = self.report.skipped.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
         let unreadable: HashSet<&str> = unreadable.map(|skip| skip.key.as_str()).collect();
         let names: Vec<&str> = self.checksums.names().filter(|name| has_ending(name, "torch")).collect();
         let scan = |name: &str| {
@@ -221,14 +218,12 @@ impl<'a> Converter<'a> {
     pub fn run(mut self, mut progress: impl FnMut(usize)) -> Result<ConversionReport, DataError> {
         self.checksums.begin()?;
         let stale = std::mem::take(&mut self.stale);
-        if !stale.is_empty() || self.is_index_outdated() {
-            // The index goes before the files that it names.
-            self.checksums.remove_all([INDEX])?;
-        }
+        // The index goes before the files that it names, and is written last.
+        self.checksums.remove_all([INDEX])?;
         self.checksums.remove_all(stale.iter().map(String::as_str))?;
         for scene in 0..self.source.num_scenes() {
             let key = self.source.key(scene);
-            if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
+            if !self.index.contains_key(key) && self.pending.iter().all(|scene| scene.key != key) {
                 match read_scene(self.source, scene, self.options.encoding, self.options.max_size) {
                     Ok((record, num_encoded)) => self.add(record, num_encoded)?,
                     Err(error) => self.report.skipped.skip(key, error.to_string()),
@@ -237,14 +232,6 @@ impl<'a> Converter<'a> {
             progress(self.index.len() + self.pending.len());
         }
         self.finish()
-    }
-
-    /// Returns whether the index of an earlier run names missing files.
-    fn is_index_outdated(&self) -> bool {
-        let complete: HashSet<&str> = self.checksums.names().collect();
-        let names_missing =
-            |index: BTreeMap<String, String>| index.values().any(|file| !complete.contains(file.as_str()));
-        complete.contains(INDEX) && read_index(&self.folder.join(INDEX)).map_or(true, names_missing)
     }
 
     fn add(&mut self, record: SceneRecord, num_encoded: usize) -> Result<(), DataError> {
@@ -266,7 +253,6 @@ impl<'a> Converter<'a> {
         self.report.num_encoded += num_encoded;
         self.report.image_bytes += record.image_bytes();
         self.fill.add(&record);
-        self.pending_keys.insert(record.key.clone());
         self.pending.push(record);
         match self.options.to {
             ConvertTo::Chunks { target_bytes } if !self.fill.is_full(target_bytes) => Ok(()),
@@ -291,7 +277,6 @@ impl<'a> Converter<'a> {
         };
         self.checksums.write(&name, &bytes)?;
         self.index.extend(scenes.into_iter().map(|scene| (scene.key, name.clone())));
-        self.pending_keys.clear();
         self.fill = ChunkFill::default();
         Ok(())
     }

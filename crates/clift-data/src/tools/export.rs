@@ -1,4 +1,4 @@
-//! Writes the scenes of a source as chunks, and an evaluation index.
+//! Scenes of a source as records to write, and evaluation indices.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::evaluation_index::even_views;
 use crate::scene_source::SceneSource;
-use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+use crate::sources::chunks::writer::SceneRecord;
 
 /// File format of frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -32,43 +32,6 @@ impl ImageEncoding {
             Self::Jpeg(quality) => encode_jpeg(frame, quality),
         }
     }
-}
-
-/// Counts of the written scenes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ExportReport {
-    /// Number of scenes.
-    pub num_scenes: usize,
-    /// Number of frames of all scenes.
-    pub num_frames: usize,
-    /// Bytes of the encoded frames.
-    pub image_bytes: u64,
-}
-
-/// Writes every scene of `source` into `folder` with [`write_chunks`]. Frames without an image file are encoded.
-///
-/// Calls `progress` with the number of finished scenes after each scene. Frames of a scene are read on all cores.
-///
-/// # Errors
-/// The errors of reading a scene, encoding a frame and [`write_chunks`].
-pub fn write_source(
-    source: &dyn SceneSource,
-    folder: &Path,
-    encoding: ImageEncoding,
-    target_bytes: u64,
-    mut progress: impl FnMut(usize),
-) -> Result<ExportReport, DataError> {
-    let mut total = ExportReport::default();
-    let scenes = (0..source.num_scenes()).map(|scene| {
-        let (record, _) = read_scene(source, scene, encoding, None)?;
-        total.num_scenes += 1;
-        total.num_frames += record.images.len();
-        total.image_bytes += record.image_bytes();
-        progress(total.num_scenes);
-        Ok(record)
-    });
-    write_chunks(folder, scenes, target_bytes)?;
-    Ok(total)
 }
 
 /// Reads a scene, its frames on all cores. Image files are copied; other frames, and images with a side above `max_size`
@@ -143,20 +106,18 @@ mod tests {
     use crate::sampling::evaluation_index::EvaluationIndex;
     use crate::scene_source::Split;
     use crate::sources::chunks::chunk_source::ChunkSource;
+    use crate::sources::chunks::writer::write_chunks;
     use crate::sources::filters::SceneFilters;
     use crate::testing::{assert_same, rooms};
 
     #[test]
     fn written_scenes_equal_those_of_the_source() {
         let root = tempfile::tempdir().unwrap();
-        for split in [Split::Train, Split::Test] {
-            let source = rooms(|c| (c.split, c.num_scenes, c.num_frames, c.width, c.height) = (split, 5, 6, 40, 24));
-            // About two scenes to a chunk.
-            let folder = root.path().join(split.to_string());
-            let written = write_source(&source, &folder, ImageEncoding::Png, 25_000, |_| ()).unwrap();
-            assert_eq!((written.num_scenes, written.num_frames), (5, 30));
-            assert_same(&source, &ChunkSource::open(root.path(), split, &SceneFilters::default()).unwrap());
-        }
+        let source = rooms(|c| (c.num_scenes, c.num_frames, c.width, c.height) = (5, 6, 40, 24));
+        // About two scenes to a chunk.
+        let scenes = (0..5).map(|scene| Ok(read_scene(&source, scene, ImageEncoding::Png, None)?.0));
+        assert_eq!(write_chunks(&root.path().join("test"), scenes, 25_000).unwrap(), 5);
+        assert_same(&source, &ChunkSource::open(root.path(), Split::Test, &SceneFilters::default()).unwrap());
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Evaluation indices of own data, sampled like pixelSplat's: pairs of frames that overlap.
 
-use std::collections::HashMap;
+use std::collections::HashSet;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use crate::geometry::overlap::overlap;
 use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{SkipReport, note_on};
+use crate::skip_report::SkipReport;
 use crate::tools::export::write_index;
 
 /// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts, except
@@ -116,41 +116,27 @@ impl OverlapOptions {
 /// scene depend only on the cameras, the key and the seed.
 ///
 /// # Errors
-/// [`DataError::BadConfig`] for invalid options, [`DataError::BadIndex`] for a key that two sources have with different
-/// cameras, and [`DataError::Io`]. Scenes with unreadable cameras are skipped.
+/// [`DataError::BadConfig`] for invalid options, [`DataError::BadIndex`] for a key that two sources have, and
+/// [`DataError::Io`]. Scenes with unreadable cameras are skipped.
 pub fn write_overlap_index(
     path: &Path,
     sources: &[&dyn SceneSource],
     options: &OverlapOptions,
 ) -> Result<SkipReport, DataError> {
     options.validate()?;
-    let mut scenes: Vec<(&dyn SceneSource, usize)> = Vec::new();
-    let mut positions: HashMap<&str, usize> = HashMap::new();
-    let mut shared = Vec::new();
-    for (source, scene) in sources.iter().flat_map(|source| (0..source.num_scenes()).map(|scene| (*source, scene))) {
-        let key = source.key(scene);
-        let position = *positions.entry(key).or_insert(scenes.len());
-        let Some(&(other, other_scene)) = scenes.get(position) else {
-            scenes.push((source, scene));
-            continue;
-        };
-        match (other.cameras(other_scene), source.cameras(scene)) {
-            (Ok(a), Ok(b)) if a != b => {
-                let what = format!("scene {key} is in both splits with different cameras; make one index per split");
-                return Err(DataError::BadIndex { what, path: path.to_owned() });
-            }
-            (Err(_), Ok(_)) => scenes[position] = (source, scene),
-            _ => {}
-        }
-        shared.push(key);
+    let scenes = sources.iter().flat_map(|source| (0..source.num_scenes()).map(|scene| (*source, scene)));
+    let scenes: Vec<(&dyn SceneSource, usize)> = scenes.collect();
+    let mut keys = HashSet::new();
+    if let Some((source, scene)) = scenes.iter().find(|(source, scene)| !keys.insert(source.key(*scene))) {
+        let what = format!("scene {} is in both splits; make one index per split", source.key(*scene));
+        return Err(DataError::BadIndex { what, path: path.to_owned() });
     }
-    let notes = note_on(&shared, "in both splits, counted once").into_iter().collect();
     let sample = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.sample_views(source.key(*scene), &cameras)
     };
     let sampled: Vec<_> = scenes.par_iter().map(sample).collect();
-    let mut report = SkipReport { notes, ..SkipReport::new(sampled.len()) };
+    let mut report = SkipReport::new(sampled.len());
     let mut entries = Vec::with_capacity(sampled.len());
     for ((source, scene), views) in scenes.into_iter().zip(sampled) {
         let key = source.key(scene);
@@ -262,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn index_of_two_splits_has_shared_scenes_once() {
+    fn index_of_two_splits_has_all_scenes_and_refuses_shared_ones() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
@@ -273,31 +259,8 @@ mod tests {
         let alone = index(&other, &options).0;
         let of_other = written.usable().filter(|(key, _)| other.find(key).is_some());
         assert!(of_other.eq(alone.usable()));
-        let report = write_overlap_index(&path, &[&other, &other], &options).unwrap();
-        assert_eq!(report.num_scenes, 3);
-        let keys = [0, 1, 2].map(|scene| other.key(scene)).join(", ");
-        assert_eq!(report.notes, [format!("3 scenes in both splits, counted once ({keys})")]);
-        let shorter = first_is_short(rooms(20));
-        let message = write_overlap_index(&path, &[&rooms(20), &shorter], &options).unwrap_err().to_string();
-        assert!(message.contains("is in both splits with different cameras; make one index per split"), "{message}");
-    }
-
-    #[test]
-    fn readable_split_of_a_shared_scene_is_used() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let whole = rooms(20);
-        let broken =
-            TestSource::new(rooms(20)).with_cameras(|scene, _| Err(DataError::NoSuchScene { scene, num_scenes: 0 }));
-        let num_used = index(&whole, &options).1.num_used();
-        let orders: [[&dyn SceneSource; 2]; 2] = [[&whole, &broken], [&broken, &whole]];
-        for sources in orders {
-            let report = write_overlap_index(&path, &sources, &options).unwrap();
-            assert_eq!((report.num_used(), report.notes.len()), (num_used, 1), "{report}");
-        }
-        let report = write_overlap_index(&path, &[&broken, &broken], &options).unwrap();
-        assert_eq!((report.num_used(), report.skips.len()), (0, 20), "{report}");
+        let message = write_overlap_index(&path, &[&other, &other], &options).unwrap_err().to_string();
+        assert!(message.contains("-00000 is in both splits; make one index per split"), "{message}");
     }
 
     #[test]

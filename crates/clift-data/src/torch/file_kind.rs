@@ -1,10 +1,9 @@
 //! Recognition of files that are not written by `torch.save`, with the remedy.
 
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 use crate::error::DataError;
+use crate::files::bounded::read_start;
 
 /// Number of bytes read for the recognition.
 const NUM_BYTES: u64 = 512;
@@ -31,11 +30,7 @@ pub(crate) fn require_file(path: &Path) -> Result<(), DataError> {
 
 /// Returns a description of a file that is no ZIP archive; `None` for an unknown format.
 pub(crate) fn other_format(path: &Path) -> Option<&'static str> {
-    let mut start = Vec::new();
-    let file = File::open(path).ok()?;
-    let num_bytes = file.metadata().ok()?.len();
-    file.take(NUM_BYTES).read_to_end(&mut start).ok()?;
-    other_kind(&start, num_bytes)
+    other_kind(&read_start(path, NUM_BYTES)?, std::fs::metadata(path).ok()?.len())
 }
 
 /// Returns a description of a file with this start; `None` if the format is unknown or a ZIP archive.

@@ -3,13 +3,11 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{
-    FileOptions, OpenedSource, RgbImage, SourceKind, SourceOptions, Split, decode_image, encode_jpeg, encode_png,
-};
+use clift_data::{FileOptions, OpenedSource, RgbImage, decode_image, encode_jpeg, encode_png};
 use serde_json::{Value, json};
 
-use crate::files::{copy_folder, copy_of_layout, fixtures, frame_at, write_capture};
-use crate::{open, open_test, open_with, skipped_frames};
+use crate::files::{copy_of_layout, frame_at, write_capture};
+use crate::{open_test, open_with, skipped_frames};
 
 fn image(width: usize, height: usize) -> RgbImage {
     RgbImage { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
@@ -211,26 +209,4 @@ fn photos_without_cameras_name_the_tools_for_poses() {
     fs::remove_dir_all(root.path().join("images")).unwrap();
     fs::remove_dir_all(root.path().join("more")).unwrap();
     assert!(!open_test(root.path()).err().unwrap().contains("colmap"));
-}
-
-#[test]
-fn listed_scenes_missing_from_test_are_flagged() {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&fixtures().join("re10k-mini"), root.path());
-    let list = root.path().join("list");
-    fs::write(&list, "00000000000000a1\n00000000000000b1\n").unwrap();
-    let flagged = |layout| {
-        let files = FileOptions { test_scenes: Some(list.clone()), ..FileOptions::default() };
-        let options = SourceOptions { kind: layout, files, ..SourceOptions::default() };
-        let opened = open(root.path(), Split::Train, &options).unwrap();
-        assert_eq!((opened.source.num_scenes(), opened.report.skips.len()), (1, 1));
-        let flagged = clift_data::skipped_scenes(&opened.report).into_iter();
-        flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()
-    };
-    let reason = "kept for testing by the list of test scenes, but not in test/".to_owned();
-    assert_eq!(flagged(SourceKind::Auto), [("00000000000000a1".to_owned(), reason.clone())]);
-    assert_eq!(flagged(SourceKind::Scenes), [("00000000000000a1".to_owned(), reason)]);
-    fs::remove_dir_all(root.path().join("test")).unwrap();
-    copy_folder(&root.path().join("train"), &root.path().join("test"));
-    assert!(flagged(SourceKind::Auto).is_empty(), "the test split has it");
 }

@@ -107,14 +107,6 @@ mod tests {
     use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes};
 
     #[test]
-    fn byte_order_mark_of_an_index_is_skipped() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        std::fs::write(&path, "\u{feff}{\"a\": \"000000.torch\"}").unwrap();
-        assert_eq!(read_index(&path).unwrap(), BTreeMap::from([("a".to_owned(), "000000.torch".to_owned())]));
-    }
-
-    #[test]
     fn keys_may_end_in_the_file_extension() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.torch.torch");

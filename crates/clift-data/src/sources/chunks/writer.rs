@@ -28,7 +28,8 @@ pub struct SceneRecord {
 }
 
 impl SceneRecord {
-    pub(crate) fn image_bytes(&self) -> u64 {
+    /// Returns the number of bytes of all images.
+    pub fn image_bytes(&self) -> u64 {
         self.images.iter().map(|image| image.len() as u64).sum()
     }
 

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
-use crate::files::bounded::read_bounded;
+use crate::files::bounded::{read_bounded, read_start};
 use crate::geometry::camera::Camera;
 use crate::sources::photos::image_folder::numbered_images;
 use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene};
@@ -75,12 +75,6 @@ fn parse_line(line: &str) -> Result<(i64, Camera), String> {
 
 /// Returns whether the first or second line of a text file is a camera of RealEstate10K.
 pub(crate) fn looks_like_re10k(path: &Path) -> bool {
-    use std::io::Read;
-    let is_file = std::fs::metadata(path).is_ok_and(|metadata| metadata.is_file());
-    let Some(file) = is_file.then(|| std::fs::File::open(path).ok()).flatten() else { return false };
-    let mut head = Vec::new();
-    if file.take(4096).read_to_end(&mut head).is_err() {
-        return false;
-    }
-    String::from_utf8_lossy(&head).lines().take(2).any(|line| parse_line(line).is_ok())
+    let Some(start) = read_start(path, 4096) else { return false };
+    String::from_utf8_lossy(&start).lines().take(2).any(|line| parse_line(line).is_ok())
 }

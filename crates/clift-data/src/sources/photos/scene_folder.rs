@@ -28,10 +28,7 @@ pub(crate) enum SceneFiles {
 impl SceneFiles {
     /// Whether a folder with these files is a capture of its own, whatever its name; clips lie in folders of a data set.
     pub fn is_capture(&self) -> bool {
-        match self {
-            Self::Transforms(_) | Self::Colmap { .. } => true,
-            Self::Re10kText { .. } => false,
-        }
+        !matches!(self, Self::Re10kText { .. })
     }
 }
 

@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use crate::synthetic::real::dice::Dice;
-use crate::synthetic::texture::linear_color;
+use crate::synthetic::tracing::surface::linear_color;
 
 /// The hues that the surfaces of one scene share.
 pub(crate) struct Palette {

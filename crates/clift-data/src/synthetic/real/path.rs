@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use glam::{DMat3, Vec3};
+use glam::{DMat3, Vec3, Vec4};
 
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::pose::Pose;
@@ -165,7 +165,7 @@ impl Path {
             let at = |step: usize| (step as f32 + 0.5 - 0.5 * SIDE as f32) * scale;
             let lanes = [0, 1, 2, 3].map(|lane| first + lane);
             let (x, y) = (lanes.map(|lane| at(lane % SIDE)), lanes.map(|lane| at(lane / SIDE)));
-            let rays = Rays::through(origin, &rotation, x.into(), y.into());
+            let rays = Rays::through(origin, &rotation, Vec4::from_array(x), Vec4::from_array(y));
             let ((distances, numbers), directions) = (world.nearest(&rays), rays.directions());
             [0, 1, 2, 3].map(|lane| (origin, directions[lane], distances[lane], numbers[lane]))
         })

@@ -1,4 +1,4 @@
-//! Solids, patterns and light of scenes with many surfaces, traced four rays at a time.
+//! Patterns of surfaces; solids and light of scenes with many surfaces, traced four rays at a time.
 //!
 //! - `noise`: hashes, filtered noise and waves
 //! - `surface`: patterns on surfaces

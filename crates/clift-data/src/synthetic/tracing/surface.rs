@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use crate::synthetic::tracing::noise::{byte, edge, floor, hash, octaves, pulse, value_noise};
+use crate::synthetic::tracing::noise::{byte, edge, floor, hash, octaves, pulse, smooth, value_noise};
 
 /// Pattern of a surface; lengths are in periods of the pattern.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,6 +44,33 @@ pub(crate) enum Pattern {
         width: f32,
         height: f32,
     },
+    /// Sine waves, unfiltered; lengths and the phase are in radians.
+    Waves {
+        wave: Wave,
+        phase: f32,
+    },
+}
+
+/// Share of the second colour as a function of two angles.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Wave {
+    Gradient,
+    Stripes,
+    Checkers,
+    Ripples,
+}
+
+impl Wave {
+    fn share(self, along: f32, across: f32) -> f32 {
+        // Plateaus at 0 and 1 with edges wider than a pixel.
+        let soft_edge = |wave: f32| smooth(0.5 + 1.2 * wave);
+        match self {
+            Self::Gradient => 0.5 + 0.5 * (0.5 * along).sin(),
+            Self::Stripes => soft_edge(along.sin()),
+            Self::Checkers => soft_edge(2.0 * (0.7 * along).sin() * (0.7 * across).sin()),
+            Self::Ripples => 0.5 + 0.25 * (along.sin() + (across + along.cos()).sin()),
+        }
+    }
 }
 
 /// Colour of a surface as a function of two coordinates along it.
@@ -145,6 +172,7 @@ impl Surface {
                 let glass = second * (1.0 + 1.2 * sharp * (byte(cell, 1) - 0.4));
                 base.lerp(third, inside(0.0)).lerp(glass, inside(0.1))
             }
+            Pattern::Waves { wave, phase } => base.lerp_monotonic(second, wave.share(x + phase, y)),
         }
     }
 
@@ -244,9 +272,27 @@ fn glyphs(x: f32, y: f32, seed: u32, width: f32) -> f32 {
     0.22 + visible * (sharp - 0.22)
 }
 
+/// Converts hue (in turns), saturation and value to a linear colour, for a display gamma of 2.
+pub(crate) fn linear_color(hue: f64, saturation: f64, value: f64) -> Vec3 {
+    let channels = [0.0, 2.0 / 3.0, 1.0 / 3.0].map(|offset: f64| {
+        let distance = ((hue + offset).rem_euclid(1.0) * 6.0 - 3.0).abs() - 1.0;
+        let shade = value * (1.0 - saturation * (1.0 - distance.clamp(0.0, 1.0)));
+        (shade * shade) as f32
+    });
+    channels.into()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn hues_a_third_apart_are_red_green_and_blue() {
+        assert_eq!(linear_color(0.0, 1.0, 1.0), Vec3::new(1.0, 0.0, 0.0));
+        assert_eq!(linear_color(1.0 / 3.0, 1.0, 1.0), Vec3::new(0.0, 1.0, 0.0));
+        assert_eq!(linear_color(-1.0 / 3.0, 1.0, 0.5), Vec3::new(0.0, 0.0, 0.25));
+        assert_eq!(linear_color(0.4, 0.0, 1.0), Vec3::ONE);
+    }
 
     #[test]
     fn patterns_have_contrast_near_and_none_far_away() {

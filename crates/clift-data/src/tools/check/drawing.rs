@@ -3,6 +3,7 @@
 use glam::DMat3;
 
 use crate::image::rgb_image::RgbImage;
+use crate::tools::check::matches::subsample;
 use crate::tools::features::epipolar::{Correspondence, WIDTH, line, line_back};
 use crate::tools::features::image_features::reduced;
 
@@ -27,7 +28,9 @@ pub(crate) fn epipolar_image(frames: &[RgbImage; 2], geometry: &DMat3, matches: 
             canvas.rgb[at..at + pixels.len()].copy_from_slice(pixels);
         }
     }
-    let plotted = spread(matches);
+    let mut sorted = matches.to_vec();
+    sorted.sort_by(|a, b| a.first[0].total_cmp(&b.first[0]));
+    let plotted: Vec<Correspondence> = subsample(&sorted, NUM_PLOTTED).collect();
     for (i, pair) in plotted.iter().enumerate() {
         let colour = colour(i, plotted.len());
         let sides = [(pair.first, line_back(geometry, pair.second)), (pair.second, line(geometry, pair.first))];
@@ -56,22 +59,6 @@ pub(crate) fn epipolar_image(frames: &[RgbImage; 2], geometry: &DMat3, matches: 
         }
     }
     canvas
-}
-
-/// Selects matches far from each other in the first image (farthest point sampling).
-fn spread(matches: &[Correspondence]) -> Vec<Correspondence> {
-    let mut selected: Vec<Correspondence> = Vec::new();
-    let squared =
-        |a: &Correspondence, b: &Correspondence| (0..2).map(|i| (a.first[i] - b.first[i]).powi(2)).sum::<f64>();
-    let mut nearest = vec![f64::INFINITY; matches.len()];
-    while selected.len() < NUM_PLOTTED.min(matches.len()) {
-        let farthest = (0..matches.len()).reduce(|a, b| if nearest[b] > nearest[a] { b } else { a }).unwrap_or(0);
-        selected.push(matches[farthest]);
-        for (nearest, other) in nearest.iter_mut().zip(matches) {
-            *nearest = nearest.min(squared(&matches[farthest], other));
-        }
-    }
-    selected
 }
 
 /// Returns a colour of the hue wheel; consecutive colours are far apart.

@@ -5,11 +5,11 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 use crate::skip_report::plural;
-use crate::statistics::{mean, median};
+use crate::statistics::median;
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::frames::{exchange_neighbours, frame_distances, triplet_distances, wrong_frames};
 use crate::tools::check::images::Sizes;
-use crate::tools::check::matches::{FramePair, match_frames};
+use crate::tools::check::matches::{FramePair, match_frames, subsample};
 use crate::tools::check::mistakes::Mistake;
 use crate::tools::check::result::{FrameCheck, MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
 use crate::tools::check::triplets::find_triplets;
@@ -158,16 +158,10 @@ fn find_mistake(views: &[PixelCamera], pairs: &[FramePair]) -> Option<(Mistake, 
         let corrected: Vec<PixelCamera> = views.iter().map(|camera| mistake.corrected(camera)).collect();
         let distances = distances(&corrected);
         let ratios: Vec<f64> = medians(&distances).iter().zip(&given).map(|(new, given)| new / given).collect();
-        let is_better = ratios.iter().map(|ratio| f64::from(u8::from(*ratio < 1.0)));
-        let share = mean(&is_better.collect::<Vec<f64>>())?;
+        let num_better = ratios.iter().filter(|ratio| **ratio < 1.0).count();
+        let is_usual = num_better as f64 >= MIN_MISTAKE_SHARE * ratios.len() as f64;
         let ratio = median(&ratios);
-        (ratio < MAX_MISTAKE_RATIO && share >= MIN_MISTAKE_SHARE).then(|| (ratio, mistake, median(&distances.concat())))
+        (ratio < MAX_MISTAKE_RATIO && is_usual).then(|| (ratio, mistake, median(&distances.concat())))
     });
     tried.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, mistake, px)| (mistake, px))
-}
-
-/// Returns at most `count` of the values, evenly spaced.
-fn subsample<T: Copy>(values: &[T], count: usize) -> impl Iterator<Item = T> {
-    let kept = values.len().min(count);
-    (0..kept).map(move |index| values[index * values.len() / kept])
 }

@@ -1,6 +1,6 @@
 //! Each frame against the others: exchanged neighbours, and single cameras that do not fit.
 
-use crate::statistics::{mean, median};
+use crate::statistics::median;
 use crate::tools::check::triplets::Triplet;
 use crate::tools::features::pixel_camera::PixelCamera;
 
@@ -49,9 +49,9 @@ fn exchanged(cameras: &[PixelCamera], triplets: &[Vec<Triplet>], frame: usize) -
     let distances =
         |cameras: &[PixelCamera]| -> Vec<f64> { concerned().map(|triplet| triplet.reprojection_px(cameras)).collect() };
     let (given, new) = (distances(cameras), distances(&changed));
-    let is_better = given.iter().zip(&new).map(|(given, new)| f64::from(u8::from(new < given)));
-    let share = mean(&is_better.collect::<Vec<f64>>())?;
-    (share >= MIN_EXCHANGED_SHARE).then(|| Exchanged { frame, px: [median(&given), median(&new)] })
+    let num_better = given.iter().zip(&new).filter(|(given, new)| new < given).count();
+    (num_better > 0 && num_better as f64 >= MIN_EXCHANGED_SHARE * given.len() as f64)
+        .then(|| Exchanged { frame, px: [median(&given), median(&new)] })
 }
 
 /// Returns the reprojection distance of every triplet, by frame.

@@ -81,6 +81,12 @@ fn match_pair(features: &[Option<Features>], cameras: &[Camera], frames: [usize;
     (!matches.is_empty()).then_some(FramePair { frames, matches })
 }
 
+/// Returns at most `count` of the values, evenly spaced.
+pub(crate) fn subsample<T: Copy>(values: &[T], count: usize) -> impl Iterator<Item = T> {
+    let kept = values.len().min(count);
+    (0..kept).map(move |index| values[index * values.len() / kept])
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

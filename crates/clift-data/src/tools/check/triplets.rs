@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use glam::DVec3;
 
 use crate::statistics::median;
-use crate::tools::check::matches::FramePair;
+use crate::tools::check::matches::{FramePair, subsample};
 use crate::tools::features::pixel_camera::PixelCamera;
 
 /// Largest number of triplets of a frame.
@@ -73,8 +73,7 @@ pub(crate) fn find_triplets(num_frames: usize, pairs: &[FramePair]) -> Vec<Vec<T
                 let gap = a.abs_diff(frame).min(b.abs_diff(frame));
                 let is_between = (*a < frame) != (*b < frame);
                 let weight = corners.len() * (gap + 2 * usize::from(is_between)).min(ENOUGH_GAP);
-                let kept = corners.len().min(MAX_CORNERS);
-                let corners = (0..kept).map(|index| corners[index * corners.len() / kept]).collect();
+                let corners = subsample(&corners, MAX_CORNERS).collect();
                 triplets.push((weight, Triplet { frame, others: [*a, *b], corners }));
             }
         }

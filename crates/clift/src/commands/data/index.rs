@@ -6,8 +6,9 @@ use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 
 use crate::commands::args::parse::{parse_distance, parse_output};
 use crate::commands::args::splits::{SourceArgs, Splits};
+use crate::exit_code::usage_bail;
 use crate::output::output_file::OutputFile;
-use crate::output::stdout::{print_note, print_result};
+use crate::output::stdout::print_result;
 
 pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     let options = OverlapOptions {
@@ -26,9 +27,6 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     }
     let sources: Vec<&dyn SceneSource> = splits.iter().map(|split| split.opened.source.as_ref()).collect();
     let report = write_overlap_index(&args.out, &sources, &options)?;
-    for note in &report.notes {
-        print_note(&format!("note: {note}"));
-    }
     let file = if report.num_used() > 0 { args.out.display().to_string() } else { "no file written".into() };
     print_result(&format!("{} of {} with views: {file}", plural(report.num_used(), "scene"), report.num_scenes))?;
     for (reason, number) in report.counts() {

@@ -6,7 +6,7 @@ use std::time::Instant;
 use anyhow::Context;
 use clift_data::{
     ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, TEMPORARY,
-    plural, publish_folder, write_evaluation_index, write_source,
+    plural, publish_folder, read_scene, write_chunks, write_evaluation_index,
 };
 use clift_eval::EvalConfig;
 use clift_model::ModelConfig;
@@ -63,14 +63,19 @@ fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyh
         let removing = || format!("removing the folder of an interrupted command, {}", unfinished.display());
         std::fs::remove_dir_all(&unfinished).with_context(removing)?;
     }
-    let written = write_source(&source, &unfinished, args.chunks.encoding(), args.chunks.target_bytes(), |done| {
-        counter.set(done as u64);
-    })?;
+    let mut image_bytes = 0;
+    let scenes = (0..config.num_scenes).map(|scene| {
+        let (record, _) = read_scene(&source, scene, args.chunks.encoding(), None)?;
+        image_bytes += record.image_bytes();
+        counter.set(scene as u64 + 1);
+        Ok(record)
+    });
+    let num_scenes = write_chunks(&unfinished, scenes, args.chunks.target_bytes())?;
     publish_folder(&unfinished, &folder).with_context(|| format!("writing {}", folder.display()))?;
     drop(counter);
-    let (scenes, frames) = (plural(written.num_scenes, "scene"), plural(config.num_frames, "frame"));
+    let (scenes, frames) = (plural(num_scenes, "scene"), plural(config.num_frames, "frame"));
     let size = format!("{}x{}", config.width, config.height);
-    let (bytes, seconds) = (file_size(written.image_bytes), started.elapsed().as_secs_f64());
+    let (bytes, seconds) = (file_size(image_bytes), started.elapsed().as_secs_f64());
     print_result(&format!("{split}: {scenes} of {frames}, {size}, {bytes} in {seconds:.1} s: {}", folder.display()))?;
     if split == Split::Test {
         let EvalConfig { num_context, num_targets, .. } = EvalConfig::default();
@@ -320,7 +325,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let config = SyntheticConfig { num_scenes: 1, num_frames: 3, width: 16, height: 8, ..Default::default() };
         let source = SyntheticSource::new(config.clone()).unwrap();
-        write_source(&source, &folder.path().join("train"), ImageEncoding::Png, 1, |_| ()).unwrap();
+        let record = read_scene(&source, 0, ImageEncoding::Png, None).unwrap().0;
+        write_chunks(&folder.path().join("train"), [Ok(record)], 1).unwrap();
         let refused = |splits, config| require_same_size(folder.path(), splits, &config).err();
         assert!(refused(Splits::Test, config.clone()).is_none());
         for (other, requested) in [
