@@ -22,7 +22,7 @@ const TOLERANCE_BF16: f64 = 2e-1;
 /// Prints the machine and a row per device, or runs the stability cases; fails with the default device or a case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
-        return stability::run(args.small, args.markdown.as_deref());
+        return stability::run(args.markdown.as_deref());
     }
     let machine = [("clift", version())].into_iter().chain(machine_rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
@@ -154,9 +154,6 @@ pub struct DoctorArgs {
     /// Run the stability cases instead: hard numerical inputs against f64
     #[arg(long)]
     pub stability: bool,
-    /// Run small versions of the cases: seconds instead of minutes
-    #[arg(long, requires = "stability")]
-    pub small: bool,
     /// Write the table of the cases as Markdown
     #[arg(long, requires = "stability", value_name = "FILE", value_parser = parse_output)]
     pub markdown: Option<PathBuf>,
