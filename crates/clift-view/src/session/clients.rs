@@ -244,7 +244,9 @@ mod tests {
             let mut served = Vec::new();
             for seq in 0..count as u64 {
                 // A client that always has another camera does not keep the others waiting.
-                asking.iter().for_each(|id| clients.post(*id, view(seq)));
+                for id in asking {
+                    clients.post(*id, view(seq));
+                }
                 let (id, frame) = render(&clients);
                 clients.post(id, Request::Ack { seq: frame });
                 served.push(id);
