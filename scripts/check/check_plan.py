@@ -1,16 +1,13 @@
-"""Compares the estimates of `clift plan` with a measured run.
+"""Compares the memory that `clift plan` counts with a measured run.
 
     python3 scripts/check/check_plan.py configs/tiny.toml --steps 120 --scenes 40 --set ..
 
-Plans, runs the parts one after the other in processes of their own, plans again, and prints a table: parameters,
-peak resident memory, and seconds per step or scene. Other work on the machine changes the seconds; the two plans
-show by how much.
+Plans, runs the parts one after the other in processes of their own, and prints a table of their peak resident memory.
 """
 
 import argparse
 import json
 import os
-import statistics
 import subprocess
 import tempfile
 import time
@@ -24,12 +21,11 @@ def plan(clift: str, arguments: list[str], folder: Path) -> dict[str, dict]:
     return {part["part"]: part for part in json.loads(path.read_text())["parts"]}
 
 
-def measured(command: list[str]) -> tuple[int, float]:
-    """Peak resident bytes and seconds of a process.
+def measured(command: list[str]) -> int:
+    """Peak resident bytes of a process.
 
     Read from /proc while it runs: what some kernels report at the end of a process with several threads is a third of it.
     """
-    started = time.monotonic()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     peak = 0
     while True:
@@ -45,14 +41,7 @@ def measured(command: list[str]) -> tuple[int, float]:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise SystemExit(f"{' '.join(command)} ended with {process.returncode}")
-    return max(peak, usage.ru_maxrss) * 1024, time.monotonic() - started
-
-
-def step_seconds(run: Path, stage: str) -> float:
-    """The fastest tenth of a stage's steps, as a plan takes the fastest of its repetitions."""
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    steps = sorted(line["step_s"] for line in lines if line["stage"] == stage and line["step"] > 3)
-    return steps[len(steps) // 10]
+    return max(peak, usage.ru_maxrss) * 1024
 
 
 def main() -> None:
@@ -81,28 +70,17 @@ def main() -> None:
             "checkpoint.every=0",
         ]
         arguments = [options.config, *(word for key in keys for word in ("--set", key))]
-        before = plan(options.clift, arguments, folder)
-        results = {}
+        planned = plan(options.clift, arguments, folder)
+        peaks = {}
         for part in ["stage1", "clusters", "stage2"]:
-            peak, seconds = measured([options.clift, "train", *arguments, "--only", part])
-            results[part] = (peak, seconds / before[part]["count"])
-            if part != "clusters":
-                steps = [step_seconds(run, part), before[part]["compute_s"]]
-                print(f"{part}: the fastest tenth of updates takes {steps[0]:.4g} s, planned {steps[1]:.4g} s")
-        peak, seconds = measured([options.clift, "eval", str(run), "--force"])
-        results["eval"] = (peak, seconds / options.scenes)
-        after = plan(options.clift, arguments, folder)
+            peaks[part] = measured([options.clift, "train", *arguments, "--only", part])
+        peaks["eval"] = measured([options.clift, "eval", str(run), "--force"])
 
-    print()
-    print("| part | memory planned | measured | ratio | seconds planned (before, after) | measured | ratio |")
-    print("|---|---|---|---|---|---|---|")
-    for part, (peak, seconds) in results.items():
-        planned = before[part]["peak_bytes"]
-        times = [times[part]["seconds"] for times in (before, after)]
-        print(
-            f"| {part} | {planned / 1e6:.0f} MB | {peak / 1e6:.0f} MB | {planned / peak:.2f} "
-            f"| {times[0]:.4g}, {times[1]:.4g} | {seconds:.4g} | {statistics.mean(times) / seconds:.2f} |"
-        )
+    print("| part | memory planned | measured | ratio |")
+    print("|---|---|---|---|")
+    for part, peak in peaks.items():
+        bytes_ = planned[part]["peak_bytes"]
+        print(f"| {part} | {bytes_ / 1e6:.0f} MB | {peak / 1e6:.0f} MB | {bytes_ / peak:.2f} |")
 
 
 if __name__ == "__main__":

@@ -4,12 +4,14 @@
 use burn::tensor::{DType, Tensor};
 use clift_model::{DeviceName, Precision, adapters, max_tensor_bytes};
 
+#[allow(dead_code)]
+mod support;
+
 #[test]
 fn adapter_limits_hold_on_the_open_device() {
     let device = match DeviceName::Wgpu.open() {
         Ok(device) => device,
-        Err(error) if std::env::var_os("CLIFT_REQUIRE_WGPU").is_some() => panic!("{error}"),
-        Err(error) => return eprintln!("not run: {error}"),
+        Err(error) => return support::skip("wgpu", &error.to_string()),
     };
     let adapters = adapters();
     let used = adapters.iter().find(|adapter| adapter.is_used).expect("the device is one of them");

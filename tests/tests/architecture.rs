@@ -37,7 +37,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-bench",
         "clift-kernels clift-model clift-data clift-eval clift-train",
-        "allreduce cases data_reading runner precision doctor plan",
+        "allreduce cases data_reading runner precision doctor",
     ),
     ("clift-view", "clift-kernels clift-model clift-data clift-eval", "error protocol scenes session server"),
     (

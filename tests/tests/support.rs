@@ -1,6 +1,7 @@
 //! Runs the command line in temporary folders and reads the files of the runs.
 
 use std::collections::BTreeMap;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
@@ -11,6 +12,21 @@ use tempfile::TempDir;
 
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").join(path)
+}
+
+/// Reports that this test cannot run on this machine, as a line `skipped: TEST: REASON` that `.ci/run` repeats at its end.
+///
+/// # Panics
+/// Where the variable `CLIFT_REQUIRE_TOOL` is set, such as `CLIFT_REQUIRE_FFMPEG` for the tool `ffmpeg`.
+#[track_caller]
+pub fn skip(tool: &str, reason: &str) {
+    let variable = format!("CLIFT_REQUIRE_{}", tool.to_uppercase());
+    assert!(std::env::var_os(&variable).is_none(), "{variable} is set: {reason}");
+    let thread = std::thread::current();
+    let test = thread.name().filter(|name| *name != "main").unwrap_or(tool);
+    // Not `eprintln`: the test harness hides what a passing test prints by it.
+    let line = format!("skipped: {test}: {reason}\n");
+    std::io::stderr().write_all(line.as_bytes()).expect("the standard error is open");
 }
 
 #[derive(Debug)]
@@ -119,7 +135,7 @@ impl Shared {
     }
 }
 
-/// A small file system in memory, unmounted when dropped; needs root.
+/// A small file system in memory, unmounted when dropped; needs root, without which the test is skipped.
 pub struct SmallDisk<'a>(&'a Path);
 
 impl<'a> SmallDisk<'a> {
@@ -127,7 +143,11 @@ impl<'a> SmallDisk<'a> {
         std::fs::create_dir(folder).expect("writable");
         let options = format!("size={kib}k");
         let mount = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "clift-test"]).arg(folder).output();
-        mount.ok().filter(|output| output.status.success()).map(|_| Self(folder))
+        let disk = mount.ok().filter(|output| output.status.success()).map(|_| Self(folder));
+        if disk.is_none() {
+            skip("tmpfs", "no right to mount a tmpfs");
+        }
+        disk
     }
 }
 

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use clift_data::{median, p95};
-use clift_train::{Ranks, TrainError};
+use clift_train::{Ranks, TrainError, sent_bytes};
 use serde::Serialize;
 
 /// The measured sum over ranks.
@@ -35,12 +35,6 @@ impl AllReduceRow {
     pub fn gb_per_s(&self) -> f64 {
         self.sent_bytes as f64 / self.median_s / 1e9
     }
-}
-
-/// Returns the bytes that each of `num_ranks` ranks sends to sum `num_values` f32 values: as many as in a ring.
-pub fn sent_bytes(num_values: u64, num_ranks: usize) -> u64 {
-    let num_ranks = num_ranks as u64;
-    2 * (num_ranks - 1) * 4 * num_values / num_ranks
 }
 
 /// Sums vectors of each size over the ranks, `repeats` times after one warm-up, and checks the sums.
@@ -86,10 +80,5 @@ mod tests {
         let report = measure_allreduce(&Ranks::single(), &[0, 1, 1000], 2).unwrap();
         assert_eq!(report.rows.iter().map(|row| row.sent_bytes).collect::<Vec<_>>(), [0, 0, 0]);
         assert!(report.rows.iter().all(|row| row.median_s <= row.p95_s));
-    }
-
-    #[test]
-    fn bytes_are_those_of_a_ring() {
-        assert_eq!([2, 4].map(|num_ranks| sent_bytes(100, num_ranks)), [400, 600]);
     }
 }

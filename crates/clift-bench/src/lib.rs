@@ -1,4 +1,4 @@
-//! Measures the program itself: `clift bench`, `clift doctor` and `clift plan`.
+//! Measures the program itself: `clift bench` and `clift doctor`.
 //!
 //! ```
 //! use std::sync::atomic::AtomicBool;
@@ -19,7 +19,6 @@ mod allreduce;
 mod cases;
 mod data_reading;
 mod doctor;
-mod plan;
 mod precision;
 mod runner;
 
@@ -32,10 +31,8 @@ pub use precision::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_prec
 // Reading of clips
 pub use data_reading::{ReadClip, Throughput, ThroughputOptions, measure_reading};
 // The sum over ranks
-pub use allreduce::{AllReduceReport, AllReduceRow, measure_allreduce, sent_bytes};
+pub use allreduce::{AllReduceReport, AllReduceRow, measure_allreduce};
 // Devices and numerical stability
 pub use doctor::probe::{DeviceCheck, Gradient, catch_panic, probe};
 pub use doctor::stability::case::{Bound, CaseSize, Outcome, StabilityCase, StabilityRow};
 pub use doctor::stability::suite::{outcome_text, run_stability, stability_markdown};
-// Memory and time of a run before it starts
-pub use plan::plan::{PartPlan, Plan, PlanOptions, check_plan, missing_weights, plan};

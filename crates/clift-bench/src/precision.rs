@@ -1,20 +1,18 @@
 //! `clift bench precision`: time and error of f16 or bf16 products beside f32 products.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
 
-use burn::tensor::Tensor;
 use clift_data::median;
 use clift_eval::psnr_of_mse;
 use clift_model::{DeviceName, Precision};
-use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze};
+use clift_train::{Config, Stage, TrainError, freeze};
 use serde::Serialize;
 
 use crate::cases::case::BenchCase;
 use crate::cases::context::{BenchContext, BenchOptions};
 use crate::cases::forward::{encode, render};
-use crate::cases::reference::{flat_gradient, values};
-use crate::cases::step::{gradients, loss_factor, micro_batch};
+use crate::cases::reference::values;
+use crate::cases::step::{loss_and_gradient, micro_batch};
 use crate::cases::task::BenchTask;
 use crate::runner::prepare;
 
@@ -81,9 +79,8 @@ pub fn compare_precision(
     let contexts = [context(Precision::F32)?, context(precision)?];
     let mut rows = Vec::new();
     for case in PRECISION_CASES.into_iter().filter(|case| options.cases.contains(case)) {
-        let [f32_s, reduced_s] = median_times(case, &contexts, options, stop)?;
-        let compared = compare_results(case, &contexts[0], precision)?;
-        rows.push(PrecisionRow { f32_s, reduced_s, ratio: reduced_s / f32_s, ..compared });
+        let times = median_times(case, &contexts, options, stop)?;
+        rows.push(compare_results(case, &contexts[0], precision, times)?);
     }
     Ok(PrecisionReport { device: config.device, precision, rows })
 }
@@ -107,55 +104,54 @@ fn median_times(
                 return Err(TrainError::Abandoned { task: format!("timing `{case}`") });
             }
             let _scope = scoped(context);
-            context.sync()?;
-            let started = Instant::now();
-            task.run()?;
-            context.sync()?;
+            let seconds = context.time(task.as_mut())?;
             if repeat >= options.warmup {
-                samples.push(started.elapsed().as_secs_f64());
+                samples.push(seconds);
             }
         }
     }
     Ok(samples.map(|samples| median(&samples)))
 }
 
-fn compare_results(case: BenchCase, context: &BenchContext, reduced: Precision) -> Result<PrecisionRow, TrainError> {
-    let both = |forward: &dyn Fn() -> Tensor<1>| {
-        [Precision::F32, reduced].map(|precision| {
-            let _scope = precision.scope();
-            values(forward())
-        })
-    };
-    let row = PrecisionRow { case, f32_s: 0.0, reduced_s: 0.0, ratio: 0.0, error: 0.0, loss: None, psnr_to_f32: None };
+/// Returns the loss of an update, and what a case computes, in the precision of this thread: tokens, an image or a gradient.
+fn result(case: BenchCase, context: &BenchContext) -> Result<(Option<f64>, Vec<f64>), TrainError> {
     let stage = match case {
-        BenchCase::Encode => {
-            let encode = encode(context)?;
-            let [single, reduced] = both(&|| encode.forward());
-            return Ok(PrecisionRow { error: relative_distance(&reduced, &single), ..row });
-        }
-        BenchCase::Render => {
-            let render = render(context, 1)?;
-            let [single, reduced] = both(&|| render.forward());
-            let squares = reduced.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
-            let mse = squares.sum::<f64>() / single.len() as f64;
-            let psnr_to_f32 = Some(psnr_of_mse(mse));
-            return Ok(PrecisionRow { error: relative_distance(&reduced, &single), psnr_to_f32, ..row });
-        }
+        BenchCase::Encode => return Ok((None, values(encode(context)?.forward()))),
+        BenchCase::Render => return Ok((None, values(render(context, 1)?.forward()))),
         BenchCase::Stage2Step => Stage::Stage2,
         _ => Stage::Stage1,
     };
     let model = freeze(stage, context.model());
-    let batch = micro_batch(context, stage)?;
-    let results = [Precision::F32, reduced].map(|precision| -> Result<_, TrainError> {
+    let (loss, gradient) = loss_and_gradient(&model, &micro_batch(context, stage)?, &context.device)?;
+    Ok((Some(loss), gradient))
+}
+
+fn compare_results(
+    case: BenchCase,
+    context: &BenchContext,
+    precision: Precision,
+    [f32_s, reduced_s]: [f64; 2],
+) -> Result<PrecisionRow, TrainError> {
+    // The renderer reads the same tokens in both.
+    context.lift()?;
+    let [single, reduced] = [Precision::F32, precision].map(|precision| {
         let _scope = precision.scope();
-        let device_batch = DeviceBatch::upload(&batch.clips, &context.device.clone().autodiff())?;
-        let (loss, grads) = gradients(&model, &batch, device_batch)?;
-        let factor = loss_factor();
-        Ok((loss, flat_gradient(&model, &grads).into_iter().map(|value| value / factor).collect::<Vec<_>>()))
+        result(case, context)
     });
-    let [single, reduced] = results;
     let ((single_loss, single), (reduced_loss, reduced)) = (single?, reduced?);
-    Ok(PrecisionRow { error: relative_distance(&reduced, &single), loss: Some([single_loss, reduced_loss]), ..row })
+    let psnr_to_f32 = (case == BenchCase::Render).then(|| {
+        let squares = reduced.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
+        psnr_of_mse(squares.sum::<f64>() / single.len() as f64)
+    });
+    Ok(PrecisionRow {
+        case,
+        f32_s,
+        reduced_s,
+        ratio: reduced_s / f32_s,
+        error: relative_distance(&reduced, &single),
+        loss: single_loss.zip(reduced_loss).map(<[f64; 2]>::from),
+        psnr_to_f32,
+    })
 }
 
 /// Returns `|a - b| / |b|`, NaN if a value is NaN.

@@ -4,7 +4,6 @@
 //! fast.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
 
 use clift_data::{median, p95};
 use clift_eval::{peak_bytes, start_peak};
@@ -143,21 +142,15 @@ fn measure(
 ) -> Result<BenchRow, TrainError> {
     let _precision = context.config.precision.scope();
     let mut task = prepare(case, context)?;
-    context.sync()?;
     advance(0)?;
     for _ in 0..options.warmup {
-        task.run()?;
-        context.sync()?;
+        context.time(task.as_mut())?;
         advance(1)?;
     }
     let has_peak = context.is_cpu && start_peak().is_some();
     let mut samples_s = Vec::with_capacity(options.repeats);
     for _ in 0..options.repeats {
-        let started = Instant::now();
-        task.run()?;
-        // The device may only have queued the computation.
-        context.sync()?;
-        samples_s.push(started.elapsed().as_secs_f64() / task.num_views() as f64);
+        samples_s.push(context.time(task.as_mut())? / task.num_views() as f64);
         advance(1)?;
     }
     let peak_bytes = if has_peak { peak_bytes() } else { None };

@@ -89,6 +89,21 @@ pub enum Event {
     },
     /// An update was made.
     Step(StepEvent),
+    /// The first steps of a new stage were measured.
+    Pace {
+        /// The stage.
+        stage: Stage,
+        /// Steps done.
+        step: u64,
+        /// Last step with images of the present size.
+        last_step_of_size: u64,
+        /// Last step of the stage.
+        last_step: u64,
+        /// Mean wall time of a step with its batch in seconds, without the first step.
+        step_s: f64,
+        /// Peak memory of the process; `None` if the system does not report it.
+        peak_bytes: Option<u64>,
+    },
     /// A stage without updates has processed a context set or a scene.
     Progress {
         /// The stage.

@@ -47,7 +47,7 @@ pub use distributed::communicator::Communicator;
 pub use distributed::launch::Launched;
 pub use distributed::machine::RankPlace;
 pub use distributed::parts::BatchParts;
-pub use distributed::ranks::Ranks;
+pub use distributed::ranks::{Ranks, sent_bytes};
 // A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
@@ -78,10 +78,7 @@ pub use interchange::model_dir::require_absent;
 pub use interchange::record::{ImportOptions, ImportRecord};
 // Memory and sizes of a run
 pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
-pub use footprint::memory::{memory_warning, peak_bytes};
-pub use footprint::scene_sizes::{
-    TypicalStep, cluster_counts, eval_sizes, measures_lpips, num_tokens, possible_sizes, scene_with_all_tokens,
-    scene_with_stored_tokens, typical_sizes,
-};
+pub use footprint::memory::memory_warning;
+pub use footprint::plan::{PartPlan, Plan, check_plan, plan};
 // Seeded inputs for tests and benchmarks
 pub use step::seeded_inputs::{ClipShape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};

@@ -165,11 +165,11 @@ Examples:
   clift metrics runs/tiny --csv tiny.csv
   clift metrics runs/tiny --tensorboard board --force")]
     Metrics(MetricsArgs),
-    /// Estimate parameters, memory and time of a run
+    /// Count parameters, memory and operations of a run
     ///
     /// Covers both stages, the cluster cache and the evaluation. Counts parameters exactly and memory from the tensors
-    /// that the operations keep. Times one block of each kind on the device, at the config's sizes, and reads a few
-    /// scenes if the data is present.
+    /// that the operations keep, and compares the largest tensor with the limit of the device. Needs no data.
+    /// `clift train` prints the time of a step and the time left after step 20 of each stage.
     Plan(PlanArgs),
     /// Check devices, processor and memory of this machine
     ///

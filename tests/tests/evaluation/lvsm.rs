@@ -76,7 +76,7 @@ fn latents_are_stored_and_rendered_whole() {
     assert!(!encoded.stdout.contains("clusters"), "{}", encoded.stdout);
     place.clift("render DIR/room.clift --path interpolate --frames 3 -o DIR/frames").ok().prints("5 of 5 tokens");
     place.clift("export DIR/run --format f16 -o DIR/half").ok();
-    place.clift("plan DIR/run/config.toml --no-time").ok().prints("stage1");
+    place.clift("plan DIR/run/config.toml").ok().prints("stage1");
 
     place
         .clift("render DIR/room.clift --path orbit --render 2 -o DIR/few")

@@ -1,4 +1,4 @@
-//! Evaluations and what they write, scene files, published checkpoints.
+//! Evaluations and what they write, scene files, videos, published checkpoints.
 
 mod checkpoints;
 mod coded;
@@ -8,3 +8,4 @@ mod report;
 mod scene_files;
 mod splits;
 mod tiles;
+mod videos;

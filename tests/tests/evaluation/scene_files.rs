@@ -146,28 +146,6 @@ fn camera_relative_networks_have_no_published_form() {
 }
 
 #[test]
-fn video_is_written_by_ffmpeg_or_a_warning_says_why_not() {
-    let place = Place::with(&WHOLE);
-    place.clift(&format!("{ENCODE} DIR/room.clift")).ok();
-    let render = |out: &str, change: fn(&mut Command)| {
-        let mut command = Command::new(BINARY);
-        command.args(["render", "room.clift", "--path", "orbit", "--frames", "3", "--video", "orbit.mp4", "-o", out]);
-        command.current_dir(place.at(""));
-        change(&mut command);
-        finish(start(&mut command))
-    };
-    render("a", |command| _ = command.env("PATH", "")).ok().notes("warning: no `ffmpeg` on the PATH");
-    assert!(!place.at("orbit.mp4").exists() && place.at("a/animation.png").exists());
-    if Command::new("ffmpeg").arg("-version").output().is_err() {
-        eprintln!("skipped: no ffmpeg on the PATH");
-        return;
-    }
-    render("b", |_| ()).ok();
-    assert_eq!(&place.bytes("orbit.mp4")[4..8], b"ftyp");
-    render("c", |_| ()).fails_with(2, &["orbit.mp4 exists; replace it with --force"]);
-}
-
-#[test]
 fn paths_render_to_frames_and_animation_by_count() {
     let place = Place::with(&WHOLE);
     place.clift(&format!("{ENCODE} DIR/room.clift --storage 1.0 --tokens f16")).ok();

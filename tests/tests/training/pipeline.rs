@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use crate::support::{Place, STAGE_1, WHOLE, list, number};
+use crate::support::{Place, Ran, STAGE_1, WHOLE, list, number};
 
 /// Keys of a JSON object, in any order.
 fn keys(value: &Value) -> Vec<&str> {
@@ -126,6 +126,18 @@ fn quiet_and_verbose_runs_print_less_and_more() {
     let ran = place.train("verbose -v --only stage1", &[]).ok();
     assert_eq!(ran.stderr.matches(" s/step, ").count(), 6, "{}", ran.stderr);
     place.train("quiet -q --only stage1", &["seed=1"]).fails_with(2, &["error: this run was started with other"]);
+}
+
+#[test]
+fn a_new_stage_prints_its_pace_once() {
+    let place = Place::new();
+    let train = |words: &str, steps: &str| place.train(&format!("run --only stage1{words}"), &[steps]).ok();
+    let lines = |ran: &Ran| ran.stderr.lines().filter(|line| line.contains(" per step, ")).map(String::from).collect();
+    let first: Vec<String> = lines(&train("", "stage1.steps=25"));
+    assert!(first.len() == 1 && first[0].starts_with("stage1: "), "{first:?}");
+    assert!(first[0].contains("s left, peak memory so far: "), "{first:?}");
+    let resumed: Vec<String> = lines(&train(" --extend", "stage1.steps=50"));
+    assert!(resumed.is_empty(), "{resumed:?}");
 }
 
 #[test]

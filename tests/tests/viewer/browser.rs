@@ -3,16 +3,15 @@
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::support::{BINARY, Place, WHOLE, finish, repository, start};
+use crate::support::{BINARY, Place, WHOLE, finish, repository, skip, start};
 use crate::viewer::chromium::{Chromium, decode_base64};
 use crate::viewer::tab::Viewer;
 
-/// Starts a browser, or prints why the test is skipped.
+/// Starts a browser, without which the test is skipped.
 fn browser(place: &Place) -> Option<Chromium> {
     let browser = Chromium::start(&place.at("browser"));
     if browser.is_none() {
-        assert!(std::env::var_os("CLIFT_REQUIRE_CHROMIUM").is_none(), "no Chromium on the PATH");
-        eprintln!("skipped: no Chromium on the PATH");
+        skip("chromium", "no Chromium on the PATH");
     }
     browser
 }

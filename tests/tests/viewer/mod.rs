@@ -1,7 +1,7 @@
-//! `clift view`: the page in a browser, its sockets, hostile clients, latency.
+//! `clift view`: the page in a browser, its sockets, the order of frames, hostile clients.
 
 mod browser;
 mod chromium;
+mod frames;
 mod hostile;
-mod latency;
 pub mod tab;

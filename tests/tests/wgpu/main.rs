@@ -1,7 +1,7 @@
 //! Results of a GPU (or Mesa's software Vulkan) against the CPU:
 //! `cargo test --release --workspace --features wgpu --test wgpu_suite -- --nocapture` prints a table.
 //!
-//! Without an adapter the tests print a line and pass; with `CLIFT_REQUIRE_WGPU` set they fail.
+//! Without an adapter the tests are skipped; with `CLIFT_REQUIRE_WGPU` set they fail.
 
 mod clusters;
 mod condenser;
@@ -10,6 +10,9 @@ mod no_adapter;
 mod place;
 mod reads;
 mod scene;
+#[allow(dead_code)]
+#[path = "../support.rs"]
+mod support;
 mod table;
 mod updates;
 
@@ -21,29 +24,14 @@ use clift_model::DeviceName;
 use place::Place;
 use table::{Case, Difference};
 
-/// Environment variable that makes a missing adapter a failure.
-const REQUIRED: &str = "CLIFT_REQUIRE_WGPU";
-
-/// Reason of a failure, printed without quotes.
-struct Failure(String);
-
-impl std::fmt::Debug for Failure {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
 /// The GPU, for one test at a time; `None` where there is none and none is required.
-fn gpu() -> Result<Option<(Device, MutexGuard<'static, ()>)>, Failure> {
+fn gpu() -> Option<(Device, MutexGuard<'static, ()>)> {
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
     match DeviceName::Wgpu.open() {
-        Ok(device) => Ok(Some((device, ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)))),
-        Err(error) if std::env::var_os(REQUIRED).is_some() => {
-            Err(Failure(format!("{REQUIRED} is set and the suite cannot run: {error}")))
-        }
+        Ok(device) => Some((device, ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner))),
         Err(error) => {
-            eprintln!("not run: {error}");
-            Ok(None)
+            support::skip("wgpu", &error.to_string());
+            None
         }
     }
 }
@@ -57,8 +45,8 @@ fn cases() -> impl Iterator<Item = &'static Case> {
 }
 
 #[test]
-fn every_operation_gives_what_the_cpu_gives() -> Result<(), Failure> {
-    let Some((gpu, _guard)) = gpu()? else { return Ok(()) };
+fn every_operation_gives_what_the_cpu_gives() {
+    let Some((gpu, _guard)) = gpu() else { return };
     println!("{}", table::header());
     let mut failures = Vec::new();
     for case in cases() {
@@ -69,7 +57,7 @@ fn every_operation_gives_what_the_cpu_gives() -> Result<(), Failure> {
         println!("{}", case.row(&difference, started.elapsed()));
         failures.extend(case.complaints(&difference));
     }
-    if failures.is_empty() { Ok(()) } else { Err(Failure(failures.join("\n"))) }
+    assert!(failures.is_empty(), "{}", failures.join("\n"));
 }
 
 /// Every tolerance is tight enough to fail on slightly wrong inputs.

@@ -4,8 +4,6 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use crate::REQUIRED;
-
 /// Runs a command without a Vulkan or OpenGL driver.
 fn without_adapter(command: &mut Command) -> (Option<i32>, String) {
     for variable in ["VK_ICD_FILENAMES", "VK_DRIVER_FILES", "__EGL_VENDOR_LIBRARY_FILENAMES"] {
@@ -54,16 +52,18 @@ fn cpu_runs_resume_and_load_no_driver() {
 }
 
 #[test]
-fn the_suite_passes_by_unless_it_is_required() {
+fn the_suite_is_skipped_unless_it_is_required() {
+    const SKIPPED: &str = "skipped: every_operation_gives_what_the_cpu_gives: device `wgpu`: no adapter was found";
     let this = || {
         let mut command = Command::new(std::env::current_exe().expect("the path of this test"));
-        command.args(["--exact", "--nocapture", "every_operation_gives_what_the_cpu_gives"]).env_remove(REQUIRED);
+        command
+            .args(["--exact", "--nocapture", "every_operation_gives_what_the_cpu_gives"])
+            .env_remove("CLIFT_REQUIRE_WGPU");
         command
     };
     let (code, text) = without_adapter(&mut this());
-    assert!(code == Some(0) && text.contains("not run: device `wgpu`: no adapter was found"), "{code:?}: {text}");
-    let (code, text) = without_adapter(this().env(REQUIRED, "1"));
+    assert!(code == Some(0) && text.contains(SKIPPED), "{code:?}: {text}");
+    let (code, text) = without_adapter(this().env("CLIFT_REQUIRE_WGPU", "1"));
     assert_eq!(code, Some(101), "{text}");
-    assert!(text.contains("CLIFT_REQUIRE_WGPU is set and the suite cannot run: device `wgpu`: no adapter"), "{text}");
-    assert!(!text.contains("panicked"), "{text}");
+    assert!(text.contains("CLIFT_REQUIRE_WGPU is set: device `wgpu`: no adapter"), "{text}");
 }

@@ -6,9 +6,9 @@ use burn::tensor::Device;
 use clift_train::Stage;
 use log::{LevelFilter, Log, Metadata, Record};
 
+use crate::gpu;
 use crate::place::{Place, values};
 use crate::updates::{batch, learner, step};
-use crate::{Failure, gpu};
 
 /// Counts the buffers that are mapped for reading, from the log of wgpu.
 struct CountReads;
@@ -42,8 +42,8 @@ fn count<T>(device: &Device, work: impl FnOnce() -> T) -> (T, usize) {
 }
 
 #[test]
-fn a_training_step_reads_from_the_device_once() -> Result<(), Failure> {
-    let Some((gpu, _guard)) = gpu()? else { return Ok(()) };
+fn a_training_step_reads_from_the_device_once() {
+    let Some((gpu, _guard)) = gpu() else { return };
     let place = Place::new(&gpu);
     let one = place.random([3], 1).inner();
     assert_eq!(count(&gpu, || values(one.clone())).1, 1, "a read is counted");
@@ -62,5 +62,4 @@ fn a_training_step_reads_from_the_device_once() -> Result<(), Failure> {
         println!("{name}: {first} and {second} reads in a step");
         assert_eq!([first, second], [1, 1], "{name}: loss and gradient norm, together");
     }
-    Ok(())
 }

@@ -2,6 +2,7 @@
 
 use std::cell::OnceCell;
 use std::path::PathBuf;
+use std::time::Instant;
 
 use burn::module::Module;
 use burn::tensor::Device;
@@ -11,6 +12,7 @@ use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
+use crate::cases::task::BenchTask;
 
 /// Most tokens, over all scenes of a batch, of an update whose gradient is compared with f64. At full size the f64
 /// reference would take twice the memory of the timed update and several times as long.
@@ -185,7 +187,16 @@ impl BenchContext {
         if self.is_cpu { Ok(self.device.clone()) } else { Ok(DeviceName::Flex.open()?) }
     }
 
-    pub fn sync(&self) -> Result<(), TrainError> {
+    /// Runs a task once, to the end of the device's queue, and returns the seconds.
+    pub fn time(&self, task: &mut dyn BenchTask) -> Result<f64, TrainError> {
+        self.sync()?;
+        let started = Instant::now();
+        task.run()?;
+        self.sync()?;
+        Ok(started.elapsed().as_secs_f64())
+    }
+
+    fn sync(&self) -> Result<(), TrainError> {
         self.device.sync().map_err(|error| TrainError::Device { reason: error.to_string() })
     }
 }

@@ -10,7 +10,7 @@ use clift_train::{
 };
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{ToF64, largest_magnitude, module_in_f64, values};
+use crate::cases::reference::{ToF64, flat_gradient, largest_magnitude, module_in_f64, values};
 use crate::cases::task::BenchTask;
 
 /// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
@@ -42,7 +42,7 @@ impl StepCase {
 }
 
 /// Makes the state of a stage before its first update, without the VGG network of a perceptual term.
-pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
+fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
     TrainState {
         model: freeze(stage, context.model()),
         optimizer: StageOptimizer::new(context.config.stage(stage).optimizer, &context.device),
@@ -98,7 +98,7 @@ impl ToF64 for DeviceBatch {
 }
 
 /// Returns the loss of a batch and the gradient of every parameter, multiplied by [`loss_factor`].
-pub(crate) fn gradients(
+fn gradients(
     model: &Clift,
     batch: &StageBatch,
     device_batch: DeviceBatch,
@@ -108,9 +108,20 @@ pub(crate) fn gradients(
     Ok((values(loss.inner())[0], grads))
 }
 
+/// Returns the loss of a batch and the whole gradient, in the precision of this thread.
+pub(crate) fn loss_and_gradient(
+    model: &Clift,
+    batch: &StageBatch,
+    device: &Device,
+) -> Result<(f64, Vec<f64>), TrainError> {
+    let device_batch = DeviceBatch::upload(&batch.clips, &device.clone().autodiff())?;
+    let (loss, grads) = gradients(model, batch, device_batch)?;
+    Ok((loss, flat_gradient(model, &grads).into_iter().map(|value| value / loss_factor()).collect()))
+}
+
 /// Returns the initial loss scale of this thread's precision. The f64 reference uses the same factor, a power of two, which
 /// changes no relative error.
-pub(crate) fn loss_factor() -> f64 {
+fn loss_factor() -> f64 {
     LossScale::of(Precision::current()).map_or(1.0, |scale| scale.factor())
 }
 

@@ -4,14 +4,14 @@ use std::panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use burn::optim::GradientsParams;
+use burn::module::Module;
 use burn::tensor::{DType, Device};
-use clift_data::{Clip, ClipOptions, ClipReader, SyntheticConfig, SyntheticSource, ViewIndices};
-use clift_eval::{upload_cameras, upload_images, upload_views};
-use clift_model::{Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters};
-use clift_train::mse;
+use clift_eval::upload_views;
+use clift_model::{DeviceName, KMeans, ModelConfig, Precision};
+use clift_train::{ClipShape, TrainError, seeded_batch, seeded_model};
 
-use crate::cases::reference::flat_gradient;
+use crate::cases::reference::largest_magnitude;
+use crate::cases::step::loss_and_gradient;
 
 /// Capabilities of a working device.
 #[derive(Clone, Debug)]
@@ -43,10 +43,10 @@ impl Gradient {
             return f64::NAN;
         }
         let pairs = self.values.iter().zip(&reference.values);
-        let worst = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        let scale = reference.values.iter().fold(f64::MIN_POSITIVE, |scale, value| scale.max(value.abs()));
+        let worst = largest_magnitude(pairs.map(|(a, b)| a - b));
+        let scale = largest_magnitude(reference.values.iter().copied()).max(f64::MIN_POSITIVE);
         let loss = (self.loss - reference.loss).abs() / reference.loss.abs().max(f64::MIN_POSITIVE);
-        (worst / scale).max(loss)
+        largest_magnitude([worst / scale, loss].into_iter())
     }
 }
 
@@ -64,9 +64,9 @@ fn probe_device(name: DeviceName, precision: Precision) -> Result<DeviceCheck, S
     let _scope = precision.scope();
     let floats = [("f32", DType::F32), ("f16", DType::F16), ("bf16", DType::BF16), ("f64", DType::F64)];
     let dtypes = floats.into_iter().filter(|(_, dtype)| device.supports_dtype(*dtype)).map(|(name, _)| name).collect();
-    gradient(&device).map_err(|error| format!("{error:#}"))?;
+    gradient(&device).map_err(|error| error.to_string())?;
     let started = Instant::now();
-    let gradient = gradient(&device).map_err(|error| format!("{error:#}"))?;
+    let gradient = gradient(&device).map_err(|error| error.to_string())?;
     let seconds = started.elapsed().as_secs_f64();
     Ok(DeviceCheck { adapter: adapter(name, &device), dtypes, gradient, seconds })
 }
@@ -84,10 +84,8 @@ fn adapter(_name: DeviceName, _device: &Device) -> String {
     "CPU".into()
 }
 
-/// Encodes, clusters, condenses and renders one synthetic clip, and computes the gradient of all three networks.
-fn gradient(device: &Device) -> anyhow::Result<Gradient> {
-    let clip = clip()?;
-    let device = device.clone().autodiff();
+/// Encodes, clusters, condenses and renders one clip, and computes the gradient of all three networks.
+fn gradient(device: &Device) -> Result<Gradient, TrainError> {
     let config = ModelConfig {
         dim: 32,
         num_heads: 2,
@@ -96,28 +94,15 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
         num_renderer_blocks: 1,
         ..ModelConfig::default()
     };
-    let model = Clift::new(&config, 0, &device);
-    let lift = model.encoder.forward(&upload_views(&[&clip.context], &device)?);
-    let num_tokens = lift.dims()[1];
-    // The result of K-means is not used: the nearest token may depend on the last bit of a distance.
-    let num_clusters = num_tokens / 4;
-    KMeans::default().fit(lift.values.clone().inner(), num_clusters, &[0])?;
-    let assignment = (0..num_tokens).map(|token| (token % num_clusters) as u32).collect();
-    let scene = SceneClusters::new(assignment, (0..num_clusters as u32).collect())?;
-    let index = Clusters::new(vec![scene])?.upload(&device);
-    let tokens = model.condenser.forward(lift, &index);
-    let rendering = model.renderer.forward(tokens, &upload_cameras(&[&clip.target], &device)?);
-    let loss = mse(rendering, upload_images(&[&clip.target], &device)?);
-    let grads = GradientsParams::from_grads(loss.backward(), &model);
-    Ok(Gradient { loss: loss.into_scalar::<f64>(), values: flat_gradient(&model, &grads) })
-}
-
-fn clip() -> anyhow::Result<Clip> {
-    let config = SyntheticConfig { num_scenes: 1, num_frames: 3, width: 16, height: 16, ..Default::default() };
-    let (pose_rotation, pose_scale) = Default::default();
-    let options = ClipOptions { width: 16, height: 16, pose_rotation, pose_scale, exact_principal_point: false };
-    let reader = ClipReader { source: Arc::new(SyntheticSource::new(config)?), options };
-    Ok(reader.read(0, &ViewIndices { context: vec![0, 2], target: vec![1] })?)
+    let shape = ClipShape { num_context: 2, num_targets: 1, size: [16, 16] };
+    let num_tokens = config.num_tokens(2, 16, 16)?;
+    let model = seeded_model(&config, 0, device);
+    let batch = seeded_batch(shape, 1, num_tokens, Some(num_tokens / 4), 0)?;
+    // The clusters of the batch are random: those of K-means may depend on the last bit of a distance.
+    let views = upload_views(&[&batch.clips[0].context], device)?;
+    KMeans::default().fit(model.valid().encode(&views).values, num_tokens / 4, &[0])?;
+    let (loss, values) = loss_and_gradient(&model, &batch, device)?;
+    Ok(Gradient { loss, values })
 }
 
 type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Sync + Send>;

@@ -50,12 +50,6 @@ impl Perceptual {
         Ok(Self { vgg, mean: mean_colour(options), sha256: file.finish()? })
     }
 
-    /// Makes the loss with random weights: it takes the time of the real one, and nothing else of it holds.
-    pub fn random(device: &Device) -> Self {
-        let vgg = Vgg::random(VggShape::VGG19, device).no_grad();
-        Self { vgg, mean: mean_colour((device, DType::F32)), sha256: String::new() }
-    }
-
     /// Returns the SHA-256 of the weight file, 64 hexadecimal digits.
     pub fn sha256(&self) -> &str {
         &self.sha256

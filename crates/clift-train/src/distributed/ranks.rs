@@ -193,6 +193,12 @@ impl Ranks {
     }
 }
 
+/// Returns the bytes that each of `num_ranks` ranks sends to sum `num_values` f32 values: as many as in a ring.
+pub fn sent_bytes(num_values: u64, num_ranks: usize) -> u64 {
+    let num_ranks = num_ranks as u64;
+    2 * (num_ranks - 1) * 4 * num_values / num_ranks
+}
+
 /// Returns the blocks of `len` values.
 fn blocks(len: usize) -> impl Iterator<Item = Range<usize>> {
     (0..len).step_by(BLOCK).map(move |start| start..len.min(start + BLOCK))
@@ -202,6 +208,11 @@ fn blocks(len: usize) -> impl Iterator<Item = Range<usize>> {
 mod tests {
     use super::*;
     use crate::distributed::testing::on_threads;
+
+    #[test]
+    fn sent_bytes_are_those_of_a_ring() {
+        assert_eq!([1, 2, 4].map(|num_ranks| sent_bytes(100, num_ranks)), [0, 400, 600]);
+    }
 
     #[test]
     fn sums_are_added_in_the_order_of_ranks() {

@@ -1,4 +1,4 @@
-//! Sizes of the steps of a run: all possible ones, the typical ones, the largest.
+//! Sizes of the steps of a run: all possible ones, the largest.
 
 use clift_eval::{LPIPS_MIN_SIZE_PX, Method, Sweep};
 use clift_model::SceneSizes;
@@ -11,17 +11,6 @@ use crate::events::Stage;
 pub const VIEWS_PER_PASS: usize = 8;
 /// Number of token shares over which averages are taken.
 const NUM_SHARES: usize = 9;
-
-/// Typical sizes of a step: those in the middle of the sampled ranges.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct TypicalStep {
-    /// Context views.
-    pub num_context: usize,
-    /// Most scenes of a micro-batch.
-    pub num_scenes: usize,
-    /// Sizes of a scene.
-    pub scene: SceneSizes,
-}
 
 /// Returns every size that a scene of a stage can have, equally likely; in stage 1 for a few shares of tokens.
 pub fn possible_sizes(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainError> {
@@ -39,21 +28,6 @@ pub fn possible_sizes(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, 
         all.extend((0..NUM_SHARES).map(|point| kept(scene, share(point))));
     }
     Ok(all)
-}
-
-/// Returns the middle number of contexts with the middle share (stage 1) or number (stage 2) of tokens.
-pub fn typical_sizes(config: &Config, stage: Stage) -> Result<TypicalStep, TrainError> {
-    let views = &config.data.views;
-    let num_context = usize::midpoint(views.min_context, views.max_context);
-    let scene = training_scene(config, num_context)?;
-    let scene = if stage == Stage::Stage2 {
-        let counts = cluster_counts(config, scene.num_tokens)?;
-        scene_with_stored_tokens(scene, counts[counts.len() / 2])
-    } else {
-        let [low, high] = config.stage1.keep_tokens;
-        kept(scene, f64::midpoint(low, high))
-    };
-    Ok(TypicalStep { num_context, num_scenes: config.stage(stage).micro_batch_size(), scene })
 }
 
 pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {

@@ -2,7 +2,7 @@
 //!
 //! - `lock`: lock of a run directory or an output folder
 //! - `eval_folder`: output folder of an evaluation
-//! - `batch_wait`: whether reading limits the speed
+//! - `first_steps`: pace of a stage; whether reading limits the speed
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
@@ -15,10 +15,10 @@
 //! - `evaluate_model`: evaluate a model without a run; models of other runs
 //! - `run`: a run: open, train, evaluate
 
-pub(crate) mod batch_wait;
 pub(crate) mod eval_folder;
 pub(crate) mod evaluate_model;
 pub(crate) mod extend;
+pub(crate) mod first_steps;
 pub(crate) mod init_from;
 pub(crate) mod lock;
 pub(crate) mod logs;

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use burn::module::Module;
 use clift_data::{make_folder, plural};
-use clift_eval::psnr_of_mse;
+use clift_eval::{peak_bytes, psnr_of_mse};
 use clift_model::{Clift, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
@@ -15,7 +15,7 @@ use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
-use crate::run::batch_wait::BatchWait;
+use crate::run::first_steps::{BatchWait, Pace};
 use crate::run::logs::RunLog;
 use crate::run::run_file::require_run;
 use crate::run::stage_plan::StagePlan;
@@ -98,6 +98,8 @@ pub(crate) struct TrainLoop<'a> {
     validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
     batch_wait: BatchWait,
+    /// Pace of a stage that began in this process.
+    pace: Option<Pace>,
     /// Last step with images of the present size; 0 before the first step of this process.
     last_step_of_size: u64,
     pub(crate) log: RunLog<'a>,
@@ -114,7 +116,8 @@ impl<'a> TrainLoop<'a> {
         log: RunLog<'a>,
     ) -> Self {
         let (saved, batch_wait) = (progress.step, BatchWait::new());
-        Self { plan, checkpoints, saved, progress, validation, stop, batch_wait, last_step_of_size: 0, log }
+        let pace = (progress.step == 0).then(Pace::default);
+        Self { plan, checkpoints, saved, progress, validation, stop, batch_wait, pace, last_step_of_size: 0, log }
     }
 
     pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
@@ -138,6 +141,7 @@ impl<'a> TrainLoop<'a> {
                 Err(error) => return Err(self.save_before(error, &train_state)),
             };
             train_state = self.step(train_state, &batch, &scenes)?;
+            self.report_pace(asked.elapsed().as_secs_f64());
             let is_stopped = self.plan.ranks.any(self.stop.load(Ordering::Relaxed))?;
             if is_stopped || self.is_checkpoint_due() {
                 self.save(&train_state)?;
@@ -228,6 +232,16 @@ impl<'a> TrainLoop<'a> {
             grad_norm: update.grad_norm,
             step_s: started.elapsed().as_secs_f64(),
         }));
+    }
+
+    /// Reports the pace after the first steps of a stage that began in this process.
+    fn report_pace(&mut self, step_s: f64) {
+        let Some(step_s) = self.pace.as_mut().and_then(|pace| pace.add(step_s)) else { return };
+        let StageSettings { stage, steps: last_step, .. } = self.plan.settings;
+        let step = self.progress.step;
+        let last_step_of_size = self.plan.settings.last_step_of_size(step);
+        let peak_bytes = peak_bytes();
+        self.log.event(&Event::Pace { stage, step, last_step_of_size, last_step, step_s, peak_bytes });
     }
 
     /// Counts and logs a step without update; [`TrainError::Diverged`] after `max_bad_steps` consecutive ones.

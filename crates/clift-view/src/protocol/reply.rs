@@ -71,8 +71,6 @@ pub struct Frame {
     /// Rendered tokens.
     pub tokens: usize,
     pub stored: usize,
-    /// JPEG quality, 100 for PNG.
-    pub quality: u8,
     pub select_ms: f64,
     pub render_ms: f64,
     pub encode_ms: f64,

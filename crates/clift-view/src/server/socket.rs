@@ -1,13 +1,12 @@
 //! One WebSocket: requests into the mailbox, messages out.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use axum::body::Bytes;
 use axum::extract::ws::{CloseFrame, Message, WebSocket};
 
 use crate::protocol::request::Request;
-use crate::server::rate_limit::RateLimit;
 use crate::session::clients::Clients;
 
 /// Longest time for one message to leave.
@@ -22,7 +21,6 @@ pub async fn serve(mut socket: WebSocket, clients: Arc<Clients>, hello: Bytes) {
         close(&mut socket, FULL, "too many open tabs").await;
         return;
     };
-    let mut rate = RateLimit::new(Instant::now());
     let mut next = Some(Message::Binary(hello));
     loop {
         if let Some(message) = next.take() {
@@ -49,11 +47,6 @@ pub async fn serve(mut socket: WebSocket, clients: Arc<Clients>, hello: Bytes) {
                         close(&mut socket, INVALID, "invalid request").await;
                         break;
                     }
-                }
-                // Unread messages of a flood stay with their sender.
-                let wait = rate.wait(Instant::now());
-                if !wait.is_zero() {
-                    tokio::time::sleep(wait).await;
                 }
             }
             message = messages.recv() => match message {

@@ -1,17 +1,14 @@
-//! Mailboxes of the browsers, and whose turn it is.
+//! Mailboxes of the browsers, which the render thread serves in turn.
 //!
 //! A mailbox keeps the latest request of each type, so that its memory is bounded and a slow device skips cameras instead
-//! of lagging behind. A client has at most [`MAX_IN_FLIGHT`] frames that it has not acknowledged. The client with the least
-//! device time is served first; one that was idle starts at the time of the last served, so that it saves none up.
+//! of lagging behind. A client has at most [`MAX_IN_FLIGHT`] frames that it has not acknowledged.
 
 use std::collections::BTreeMap;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
 
 use tokio::sync::mpsc;
 
 use crate::protocol::request::{CompareRequest, OpenRequest, Request, ViewRequest};
-use crate::session::frame_budget::FrameBudget;
 
 /// Frames that a client may have without acknowledging one.
 pub const MAX_IN_FLIGHT: usize = 2;
@@ -26,7 +23,7 @@ pub type ClientId = u64;
 #[derive(Debug, PartialEq)]
 pub enum Job {
     Open(OpenRequest),
-    View(ViewRequest, FrameBudget),
+    View(ViewRequest),
     Compare(CompareRequest),
     /// The client is gone.
     Forget,
@@ -45,8 +42,8 @@ struct State {
     /// Clients whose memory in the render thread is to be freed.
     gone: Vec<ClientId>,
     next_id: ClientId,
-    /// Device time of the client that was served last, at its turn.
-    clock_s: f64,
+    /// Client that was served last.
+    served: ClientId,
     is_closed: bool,
 }
 
@@ -56,50 +53,39 @@ struct Client {
     open: Option<OpenRequest>,
     view: Option<ViewRequest>,
     compare: Option<CompareRequest>,
-    in_flight: Vec<InFlight>,
-    budget: FrameBudget,
-    /// Device time in seconds.
-    used_s: f64,
-}
-
-/// A frame that was sent and not acknowledged.
-#[derive(Clone, Copy, Debug)]
-struct InFlight {
-    seq: u64,
-    sent: Instant,
-    /// Seconds from the request's turn to the picture's bytes.
-    render_s: f64,
-    /// Budget in seconds and wanted size, while the camera moves.
-    budget: Option<(f64, usize)>,
-}
-
-/// A finished frame, for the budget of its client.
-#[derive(Clone, Copy, Debug)]
-pub struct SentFrame {
-    pub seq: u64,
-    pub budget: Option<(f64, usize)>,
+    /// Sequence numbers of the frames that were sent and not acknowledged.
+    in_flight: Vec<u64>,
 }
 
 impl Client {
-    fn has_room(&self) -> bool {
-        self.sender.capacity() > 0
+    fn can_view(&self) -> bool {
+        self.view.is_some() && self.in_flight.len() < MAX_IN_FLIGHT
     }
 
     fn is_ready(&self) -> bool {
-        let has_view = self.view.is_some() && self.in_flight.len() < MAX_IN_FLIGHT;
-        self.has_room() && (self.open.is_some() || has_view || self.compare.is_some())
+        self.sender.capacity() > 0 && (self.open.is_some() || self.can_view() || self.compare.is_some())
     }
 
+    /// Takes the next job of a client that is ready.
     fn take_job(&mut self) -> Option<Job> {
         if let Some(open) = self.open.take() {
             return Some(Job::Open(open));
         }
-        if self.in_flight.len() < MAX_IN_FLIGHT
+        if self.can_view()
             && let Some(view) = self.view.take()
         {
-            return Some(Job::View(view, self.budget));
+            return Some(Job::View(view));
         }
         self.compare.take().map(Job::Compare)
+    }
+}
+
+impl State {
+    /// Returns the ready client whose turn it is: the first one after the client that was served last.
+    fn next_ready(&self) -> Option<ClientId> {
+        let mut ready = self.clients.iter().filter(|(_, client)| client.is_ready()).map(|(id, _)| *id);
+        let first = ready.next()?;
+        Some(std::iter::once(first).chain(ready).find(|id| *id > self.served).unwrap_or(first))
     }
 }
 
@@ -113,16 +99,7 @@ impl Clients {
         let (sender, receiver) = mpsc::channel(MAX_QUEUED);
         let id = state.next_id;
         state.next_id += 1;
-        let client = Client {
-            sender,
-            open: None,
-            view: None,
-            compare: None,
-            in_flight: Vec::new(),
-            budget: FrameBudget::default(),
-            used_s: 0.0,
-        };
-        state.clients.insert(id, client);
+        state.clients.insert(id, Client { sender, open: None, view: None, compare: None, in_flight: Vec::new() });
         Some((id, receiver))
     }
 
@@ -137,11 +114,7 @@ impl Clients {
     /// Puts a request into the mailbox of its client, in place of an earlier one.
     pub fn post(&self, id: ClientId, request: Request) {
         let mut state = self.lock();
-        let clock_s = state.clock_s;
         let Some(client) = state.clients.get_mut(&id) else { return };
-        if !client.is_ready() {
-            client.used_s = client.used_s.max(clock_s);
-        }
         match request {
             Request::Open(open) => {
                 client.open = Some(open);
@@ -150,7 +123,7 @@ impl Clients {
             }
             Request::View(view) => client.view = Some(view),
             Request::Compare(compare) => client.compare = Some(compare),
-            Request::Ack { seq } => client.acknowledge(seq),
+            Request::Ack { seq } => client.in_flight.retain(|frame| *frame != seq),
         }
         if client.is_ready() {
             self.changed.notify_one();
@@ -179,50 +152,27 @@ impl Clients {
             if let Some(id) = state.gone.pop() {
                 return Some((id, Job::Forget));
             }
-            let ready = state.clients.iter_mut().filter(|(_, client)| client.is_ready());
-            let next = ready.min_by(|(_, a), (_, b)| a.used_s.total_cmp(&b.used_s));
-            let taken = next.and_then(|(&id, client)| Some((id, client.used_s, client.take_job()?)));
-            if let Some((id, used_s, job)) = taken {
-                state.clock_s = state.clock_s.max(used_s);
+            if let Some(id) = state.next_ready()
+                && let Some(job) = state.clients.get_mut(&id).and_then(Client::take_job)
+            {
+                state.served = id;
                 return Some((id, job));
             }
             state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
     }
 
-    /// Sends the result of a job that took `seconds` of the device.
-    pub fn finish(&self, id: ClientId, seconds: f64, message: Vec<u8>, frame: Option<SentFrame>) {
-        let mut state = self.lock();
-        let is_alone = !state.clients.iter().any(|(other, client)| *other != id && client.is_ready());
-        let clock_s = state.clock_s;
-        let Some(client) = state.clients.get_mut(&id) else { return };
-        client.used_s += seconds;
-        let used_s = client.used_s;
-        if let Some(SentFrame { seq, budget }) = frame {
-            client.in_flight.push(InFlight { seq, sent: Instant::now(), render_s: seconds, budget });
-        }
-        // Jobs are taken only while the queue has room, and only this thread fills it.
-        drop(client.sender.try_send(message));
-        if is_alone {
-            // Nobody waited: the time is not held against the client later.
-            state.clock_s = clock_s.max(used_s);
+    /// Sends a result, unless the client is gone: of a frame with its sequence number, which waits for the acknowledgement.
+    pub fn send(&self, id: ClientId, message: Vec<u8>, frame: Option<u64>) {
+        if let Some(client) = self.lock().clients.get_mut(&id) {
+            client.in_flight.extend(frame);
+            // Jobs are taken only while the queue has room, and only the render thread fills it.
+            drop(client.sender.try_send(message));
         }
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Client {
-    fn acknowledge(&mut self, seq: u64) {
-        let Some(position) = self.in_flight.iter().position(|frame| frame.seq == seq) else { return };
-        let InFlight { sent, render_s, budget, .. } = self.in_flight.remove(position);
-        // Rendering and transfer overlap, so that the slower of the two limits the rate.
-        let seconds = render_s.max(sent.elapsed().as_secs_f64());
-        if let Some((budget_s, size)) = budget {
-            self.budget.record(seconds, budget_s, size);
-        }
     }
 }
 
@@ -239,15 +189,15 @@ mod tests {
         serde_json::from_str(&text).unwrap()
     }
 
-    /// Takes the next job, which must be a view, and finishes it after `seconds`.
-    fn render(clients: &Clients, seconds: f64) -> (ClientId, u64) {
-        let (id, Job::View(request, _)) = clients.next_job().unwrap() else { panic!("a view") };
-        clients.finish(id, seconds, Vec::new(), Some(SentFrame { seq: request.seq, budget: None }));
+    /// Takes the next job, which must be a view, and sends an empty frame.
+    fn render(clients: &Clients) -> (ClientId, u64) {
+        let (id, Job::View(request)) = clients.next_job().unwrap() else { panic!("a view") };
+        clients.send(id, Vec::new(), Some(request.seq));
         (id, request.seq)
     }
 
     fn is_idle(clients: &Clients) -> bool {
-        !clients.lock().clients.values().any(Client::is_ready)
+        clients.lock().next_ready().is_none()
     }
 
     #[test]
@@ -257,17 +207,17 @@ mod tests {
         for seq in 0..5 {
             clients.post(id, view(seq));
         }
-        assert_eq!(render(&clients, 0.01), (id, 4));
+        assert_eq!(render(&clients), (id, 4));
         for seq in 5..9 {
             clients.post(id, view(seq));
         }
-        assert_eq!(render(&clients, 0.01), (id, 8));
+        assert_eq!(render(&clients), (id, 8));
         clients.post(id, view(9));
         assert!(is_idle(&clients), "two frames are in flight");
         clients.post(id, Request::Ack { seq: 77 });
         assert!(is_idle(&clients), "no such frame");
         clients.post(id, Request::Ack { seq: 4 });
-        assert_eq!(render(&clients, 0.01), (id, 9));
+        assert_eq!(render(&clients), (id, 9));
         assert!((0..3).all(|_| messages.try_recv().is_ok()) && messages.try_recv().is_err());
     }
 
@@ -279,34 +229,35 @@ mod tests {
         for _ in 0..MAX_QUEUED {
             clients.post(id, Request::Open(open));
             assert_eq!(clients.next_job(), Some((id, Job::Open(open))));
-            clients.finish(id, 0.0, Vec::new(), None);
+            clients.send(id, Vec::new(), None);
         }
         clients.post(id, Request::Open(open));
         assert!(is_idle(&clients));
     }
 
     #[test]
-    fn tabs_share_device_time_not_frames() {
+    fn clients_are_served_in_turn() {
         let clients = Clients::default();
-        let (slow, mut a) = clients.add().unwrap();
-        let (mut used, mut counts) = ([0.0; 2], [0; 2]);
-        // The first tab worked alone for a while, which must not cost it anything later.
-        clients.post(slow, view(0));
-        render(&clients, 5.0);
-        clients.post(slow, Request::Ack { seq: 0 });
-        let (fast, mut b) = clients.add().unwrap();
-        let cost = |id| if id == slow { 0.03 } else { 0.01 };
-        for seq in 0..400 {
-            for id in [slow, fast] {
-                clients.post(id, view(seq));
+        let all: Vec<_> = (0..3).map(|_| clients.add().unwrap()).collect();
+        let ids: Vec<_> = all.iter().map(|(id, _)| *id).collect();
+        let frames = |count: usize, asking: &[ClientId]| -> Vec<ClientId> {
+            let mut served = Vec::new();
+            for seq in 0..count as u64 {
+                // A client that always has another camera does not keep the others waiting.
+                for id in asking {
+                    clients.post(*id, view(seq));
+                }
+                let (id, frame) = render(&clients);
+                clients.post(id, Request::Ack { seq: frame });
+                served.push(id);
             }
-            let Some((id, Job::View(..))) = clients.next_job() else { panic!("a view") };
-            clients.finish(id, cost(id), Vec::new(), None);
-            let _ = if id == slow { a.try_recv() } else { b.try_recv() };
-            let index = usize::from(id == fast);
-            (used[index], counts[index]) = (used[index] + cost(id), counts[index] + 1);
-        }
-        assert!((used[0] / used[1] - 1.0).abs() < 0.05, "{used:?} s for {counts:?} frames");
+            served
+        };
+        let [a, b, c] = [ids[0], ids[1], ids[2]];
+        assert_eq!(frames(1, &[a]), [a]);
+        // The queue of a client holds four messages, which nobody reads here.
+        assert_eq!(frames(6, &ids), [b, c, a, b, c, a]);
+        assert_eq!(frames(2, &[a, c]), [b, c], "the camera of b was waiting");
     }
 
     #[test]
@@ -319,7 +270,7 @@ mod tests {
         assert_eq!(clients.next_job(), Some((ids[3].0, Job::Forget)));
         assert!(is_idle(&clients));
         clients.post(ids[3].0, view(2));
-        clients.finish(ids[3].0, 1.0, Vec::new(), None);
+        clients.send(ids[3].0, Vec::new(), None);
         assert!(clients.add().is_some());
         clients.close();
         assert_eq!(clients.next_job(), None);

@@ -15,13 +15,16 @@ use crate::protocol::request::{CompareRequest, OpenRequest, ViewRequest};
 use crate::scenes::open_scene::{OpenScene, png, scene_camera};
 use crate::scenes::scene_set::SceneSet;
 use crate::scenes::true_frames::TrueImage;
-use crate::session::clients::{ClientId, Clients, Job, SentFrame};
-use crate::session::frame_budget::{FrameBudget, FrameSettings, QUALITIES};
+use crate::session::clients::{ClientId, Clients, Job};
+use crate::session::frame_budget::{FrameBudget, FrameSettings};
 
 /// Scenes that stay on the device without a client.
 const KEPT_SCENES: usize = 3;
 /// True images that stay decoded.
 const KEPT_IMAGES: usize = 16;
+
+/// JPEG quality of the frames while the camera moves.
+const JPEG_QUALITY: u8 = 90;
 
 /// The scenes of all clients.
 pub struct RenderLoop {
@@ -35,11 +38,12 @@ pub struct RenderLoop {
     views: HashMap<ClientId, ClientView>,
 }
 
-/// The scene of a client, and the token selection of its previous frame.
+/// The scene of a client, and the token selection and time of its previous frames.
 struct ClientView {
     scene: Arc<OpenScene>,
     renderer: SceneRenderer,
     selection: SelectionPreset,
+    budget: FrameBudget,
 }
 
 impl RenderLoop {
@@ -50,21 +54,20 @@ impl RenderLoop {
     /// Works until the clients are closed.
     pub fn run(mut self, clients: &Clients) {
         while let Some((id, job)) = clients.next_job() {
-            let started = Instant::now();
+            let frame = if let Job::View(request) = &job { Some(request.seq) } else { None };
             let result = match job {
                 Job::Forget => {
                     self.views.remove(&id);
                     continue;
                 }
-                Job::Open(request) => self.open(id, request).map(|message| (message, None)),
-                Job::View(request, budget) => {
-                    self.view(id, &request, budget).map(|(message, frame)| (message, Some(frame)))
-                }
-                Job::Compare(request) => self.compare(id, &request).map(|message| (message, None)),
+                Job::Open(request) => self.open(id, request),
+                Job::View(request) => self.view(id, &request),
+                Job::Compare(request) => self.compare(id, &request),
             };
-            let (message, frame) =
-                result.unwrap_or_else(|error| (Reply::Failure { message: error.to_string() }.to_bytes(&[]), None));
-            clients.finish(id, started.elapsed().as_secs_f64(), message, frame);
+            match result {
+                Ok(message) => clients.send(id, message, frame),
+                Err(error) => clients.send(id, Reply::Failure { message: error.to_string() }.to_bytes(&[]), None),
+            }
         }
     }
 
@@ -82,23 +85,19 @@ impl RenderLoop {
         self.open.push(scene.clone());
         let message = scene.reply(self.scenes.has_true_images())?;
         let (renderer, selection) = (scene.renderer.clone(), SelectionPreset::default());
-        self.views.insert(id, ClientView { scene, renderer, selection });
+        let budget = self.views.get(&id).map_or_else(FrameBudget::default, |view| view.budget);
+        self.views.insert(id, ClientView { scene, renderer, selection, budget });
         Ok(message)
     }
 
-    fn view(
-        &mut self,
-        id: ClientId,
-        request: &ViewRequest,
-        budget: FrameBudget,
-    ) -> Result<(Vec<u8>, SentFrame), ViewError> {
-        let ClientView { scene, renderer, selection } = self.views.get_mut(&id).ok_or(ViewError::NoScene)?;
+    fn view(&mut self, id: ClientId, request: &ViewRequest) -> Result<Vec<u8>, ViewError> {
+        let begun = Instant::now();
+        let ClientView { scene, renderer, selection, budget } = self.views.get_mut(&id).ok_or(ViewError::NoScene)?;
         let stored = scene.scene.num_tokens();
-        let wanted = request.size.min(scene.sizes.len() - 1);
-        let tokens = request.tokens.clamp(1, stored);
+        let wanted =
+            FrameSettings { tokens: request.tokens.clamp(1, stored), size: request.size.min(scene.sizes.len() - 1) };
         let budget_s = request.budget_ms.filter(|_| !request.rest).map(|ms| ms.max(1.0) / 1e3);
-        let full = FrameSettings { tokens, quality: QUALITIES[0], size: wanted };
-        let FrameSettings { tokens, quality, size } = budget_s.map_or(full, |_| budget.settings(tokens, wanted));
+        let FrameSettings { tokens, size } = budget_s.map_or(wanted, |_| budget.reduce(wanted));
         if *selection != request.selection {
             *selection = request.selection;
             renderer.set_rules(selection.rules());
@@ -115,7 +114,7 @@ impl RenderLoop {
         let started = Instant::now();
         let rgb = Canvas::from_unit(&view.pixels, height, width)?.as_rgb8().to_vec();
         let image = RgbImage { width, height, rgb };
-        let picture = if request.rest { encode_png(&image)? } else { encode_jpeg(&image, quality)? };
+        let picture = if request.rest { encode_png(&image)? } else { encode_jpeg(&image, JPEG_QUALITY)? };
         let frame = Frame {
             seq: request.seq,
             rest: request.rest,
@@ -123,14 +122,15 @@ impl RenderLoop {
             size: [width, height],
             tokens,
             stored,
-            quality: if request.rest { 100 } else { quality },
             select_ms: 1e3 * view.select_s,
             render_ms: 1e3 * view.render_s,
             encode_ms: 1e3 * started.elapsed().as_secs_f64(),
         };
         let bits = if request.list_tokens { token_bits(view.tokens.as_deref(), stored) } else { Vec::new() };
-        let sent = SentFrame { seq: request.seq, budget: budget_s.map(|budget_s| (budget_s, wanted)) };
-        Ok((Reply::Frame(frame).to_bytes(&[&bits, &picture]), sent))
+        if let Some(budget_s) = budget_s {
+            budget.record(begun.elapsed().as_secs_f64(), budget_s, wanted);
+        }
+        Ok(Reply::Frame(frame).to_bytes(&[&bits, &picture]))
     }
 
     fn compare(&mut self, id: ClientId, request: &CompareRequest) -> Result<Vec<u8>, ViewError> {

@@ -2,9 +2,8 @@
 
 use std::path::PathBuf;
 
-use clift_bench::check_plan;
 use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
-use clift_train::Config;
+use clift_train::{Config, check_plan};
 use serde::Serialize;
 
 use crate::commands::args::shared_args::{JsonArg, read_config};

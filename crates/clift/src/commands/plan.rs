@@ -2,24 +2,19 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{PartPlan, Plan, PlanOptions, check_plan, missing_weights, plan};
 use clift_model::max_tensor_bytes;
-use clift_train::{Config, LargestTensor, largest_tensor, memory_warning};
+use clift_train::{Config, LargestTensor, PartPlan, Plan, check_plan, largest_tensor, memory_warning, plan};
 
-use crate::commands::args::parse::{parse_bytes, parse_count};
+use crate::commands::args::parse::parse_count;
 use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 use crate::output::stdout::{print_result, print_warning};
 use crate::output::table::table;
-use crate::output::units::{duration, file_size, memory_size, seconds};
+use crate::output::units::{file_size, memory_size};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let json = args.json.open(&[&args.config])?;
     let config = args.overrides.read(&args.config, check_plan)?;
-    for missing in missing_weights(&config) {
-        print_warning(missing);
-    }
-    let sent_bytes_per_s = args.bandwidth.map(|bytes| bytes as f64);
-    let plan = plan(&config, &PlanOptions { is_timed: !args.no_time, num_ranks: args.ranks, sent_bytes_per_s })?;
+    let plan = plan(&config, args.ranks)?;
     print_result(&report_text(&plan))?;
     print_result(&largest_tensors(&config)?)?;
     if let Some(warning) = memory_warning(&config, plan.available_bytes)? {
@@ -56,30 +51,24 @@ tokens per scene: {tokens}
 ",
         parameters.total, parameters.encoder, parameters.condenser, parameters.renderer
     );
-    let columns = ["part", "trains", "count", "peak memory", "GMACs each", "reading each", "time each", "time"];
-    let total: Option<f64> = parts.iter().map(PartPlan::total_s).sum();
-    let total = total.map(|total| format!("\ntotal: {}", duration(total)));
+    let columns = ["part", "trains", "count", "peak memory", "GMACs each"];
     let sums = (*num_ranks > 1).then(|| {
         let sent = parts.iter().filter(|part| part.sent_bytes > 0);
         let sent = sent.map(|part| format!("{} {}", part.part, file_size(part.sent_bytes))).collect::<Vec<_>>();
         format!("\none of {num_ranks} ranks; sent by a rank per step: {}", sent.join(", "))
     });
     let table = table(columns, parts.iter().map(cells));
-    [head, table].into_iter().chain(total).chain(sums).collect::<Vec<_>>().join("\n")
+    [head, table].into_iter().chain(sums).collect::<Vec<_>>().join("\n")
 }
 
-fn cells(part: &PartPlan) -> [String; 8] {
-    let dash = || "-".to_owned();
+fn cells(part: &PartPlan) -> [String; 5] {
     let count = part.count.map_or_else(|| format!("every {}", part.unit), |count| format!("{count} {}s", part.unit));
     [
         part.part.into(),
-        if part.trained_parameters == 0 { dash() } else { part.trained_parameters.to_string() },
+        if part.trained_parameters == 0 { "-".into() } else { part.trained_parameters.to_string() },
         count,
         memory_size(part.peak_bytes),
         format!("{:.3}", part.gmacs),
-        part.loading_s.map_or_else(dash, seconds),
-        part.seconds.map_or_else(dash, seconds),
-        part.total_s().map_or_else(dash, duration),
     ]
 }
 
@@ -89,15 +78,9 @@ pub struct PlanArgs {
     pub config: PathBuf,
     #[command(flatten)]
     pub overrides: ConfigArgs,
-    /// Skip the timing (it takes a few seconds)
-    #[arg(long)]
-    pub no_time: bool,
     /// Plan for one of N ranks, each with a device like this one
     #[arg(long, value_name = "N", value_parser = parse_count, default_value_t = 1)]
     pub ranks: usize,
-    /// Add the sum over ranks at SIZE per second (`clift bench allreduce`)
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
-    pub bandwidth: Option<u64>,
     #[command(flatten)]
     pub json: JsonArg,
 }
@@ -110,7 +93,7 @@ mod tests {
 
     #[test]
     fn unknown_values_are_marked() {
-        let part = |part, unit, count, seconds| PartPlan {
+        let part = |part, unit, count| PartPlan {
             part,
             unit,
             count,
@@ -118,10 +101,6 @@ mod tests {
             gmacs: 1.5,
             peak_bytes: 3 << 29,
             sent_bytes: 120,
-            compute_s: seconds,
-            busy_threads: None,
-            loading_s: None,
-            seconds,
         };
         let mut plan = Plan {
             num_ranks: 1,
@@ -130,16 +109,16 @@ mod tests {
             parameters: Parameters { encoder: 10, lift_norm: 0, condenser: 20, renderer: 30, total: 60 },
             num_tokens: [64, 96],
             available_bytes: None,
-            parts: vec![part("stage1", "step", Some(7200), Some(0.5)), part("eval", "scene", None, Some(2.0))],
+            parts: vec![part("stage1", "step", Some(7200)), part("eval", "scene", None)],
         };
         let expected = "\
 flex, 2 threads, memory available: unknown
 parameters: 60 (encoder 10, condenser 20, renderer 30)
 tokens per scene: 64 to 96
 
-part    trains  count        peak memory  GMACs each  reading each  time each  time
-stage1  30      7200 steps   1.50 GiB     1.500       -             500 ms     1 h 0 min
-eval    -       every scene  1.50 GiB     1.500       -             2.00 s     -";
+part    trains  count        peak memory  GMACs each
+stage1  30      7200 steps   1.50 GiB     1.500
+eval    -       every scene  1.50 GiB     1.500";
         assert_eq!(report_text(&plan), expected);
         plan.num_ranks = 8;
         let expected = "\none of 8 ranks; sent by a rank per step: stage1 120 bytes, eval 120 bytes";

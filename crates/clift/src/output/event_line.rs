@@ -2,7 +2,7 @@
 
 use clift_train::{Event, Stage, StepEvent};
 
-use crate::output::units::duration;
+use crate::output::units::{duration, memory_size, seconds};
 
 pub(crate) fn step_metrics(step: &StepEvent) -> String {
     format!("loss {:.4}  {:.2} dB  lr {:.2e}", step.loss, step.psnr, step.lr)
@@ -28,6 +28,12 @@ pub(crate) fn event_line(event: &Event) -> Option<String> {
         }
         Event::ImageSize { stage, size: [width, height], last_step_of_size: last_step, .. } => {
             format!("{}: images of {width} x {height} pixels to step {last_step}", stage.name())
+        }
+        Event::Pace { stage, step, last_step_of_size, last_step, step_s, peak_bytes } => {
+            let left_s = step_s * last_step_of_size.saturating_sub(*step) as f64;
+            let left = time_left(left_s, *last_step_of_size, *last_step);
+            let memory = peak_bytes.map_or_else(|| "unknown".into(), memory_size);
+            format!("{}: {} per step, {left}, peak memory so far: {memory}", stage.name(), seconds(*step_s))
         }
         Event::StageFinished { stage, elapsed_s } => format!("{}: done in {}", stage.name(), duration(*elapsed_s)),
         Event::Evaluated { stage, step, psnr, ssim, num_views } => {

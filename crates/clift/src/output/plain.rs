@@ -104,6 +104,14 @@ stage1: done in 25 s
         let events = [
             Event::StageStarted { stage: Stage::Stage2, done: 40, num_steps: 100 },
             Event::Evaluated { stage: Stage::Stage2, step: 50, psnr: 24.309, ssim: None, num_views: 12 },
+            Event::Pace {
+                stage: Stage::Stage2,
+                step: 20,
+                last_step_of_size: 100,
+                last_step: 100,
+                step_s: 0.75,
+                peak_bytes: Some(3 << 29),
+            },
             Event::Checkpoint { path: "runs/tiny/stage2/step-50".into() },
             Event::Skipped { key: "room".into(), reason: "3 frames".into() },
             Event::Warning("hot".into()),
@@ -111,6 +119,7 @@ stage1: done in 25 s
         ];
         let expected = "stage2: resumed after 40 of 100 steps
 stage2 step 50: 24.31 dB over 12 validation views
+stage2: 750 ms per step, 1 min 0 s left, peak memory so far: 1.50 GiB
 saved runs/tiny/stage2/step-50
 skipped room: 3 frames
 warning: hot

@@ -67,6 +67,12 @@ pub struct StabilityCase {
 }
 
 impl StabilityCase {
+    /// Makes the case of a whole update, whose bound is the rounding of f32 through all blocks.
+    pub(crate) const fn update(name: &'static str, breaks: &'static str, run: RunCase) -> Self {
+        let reason = "f32 through every block, forward and back: 1e-5 a block";
+        Self { name, breaks, bound: Bound::Most(1e-4), reason, run }
+    }
+
     /// Whether an outcome is within the bound.
     pub fn is_within_bound(&self, outcome: &Outcome) -> bool {
         match (self.bound, outcome) {

@@ -5,14 +5,8 @@ use clift_model::{KMeans, ModelError, SceneClusters};
 use clift_train::{BatchTokens, Stage, TrainError, seeded_batch, seeded_clusters, seeded_uniform};
 
 use crate::cases::reference::{ToF64, values};
-use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, RunCase, StabilityCase};
+use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, StabilityCase};
 use crate::doctor::stability::updates::{num_tokens, shape, stage_error};
-
-/// Makes a case whose bound is the rounding of f32 through all blocks of stage 2.
-const fn gradient_case(name: &'static str, breaks: &'static str, run: RunCase) -> StabilityCase {
-    let reason = "an update of stage 2 with open gates: 1e-5 a block";
-    StabilityCase { name, breaks, bound: Bound::Most(1e-4), reason, run }
-}
 
 pub(crate) const CASES: &[StabilityCase] = &[
     StabilityCase {
@@ -29,10 +23,10 @@ pub(crate) const CASES: &[StabilityCase] = &[
         reason: "the inertia is zero",
         run: |devices| inertia_error(devices, 1, 8),
     },
-    gradient_case("N_s = 1", "a condenser of one centroid: its softmax has one score", |devices| {
+    StabilityCase::update("N_s = 1", "a condenser of one centroid: its softmax has one score", |devices| {
         condenser_error(devices, |count| seeded_clusters(count, 1, 0, 0))
     }),
-    gradient_case("N_s = N", "no members: equation 2 has no keys", |devices| {
+    StabilityCase::update("N_s = N", "no members: equation 2 has no keys", |devices| {
         condenser_error(devices, |count| Ok(SceneClusters::identity(count)))
     }),
     StabilityCase {
@@ -49,14 +43,14 @@ pub(crate) const CASES: &[StabilityCase] = &[
             }
         },
     },
-    gradient_case("singletons: every cluster but one", "segments without a key beside a full one", |devices| {
+    StabilityCase::update("singletons: every cluster but one", "segments without a key beside a full one", |devices| {
         condenser_error(devices, |count| {
             let stored = count / 2;
             let assignment = (0..count).map(|token| if token < stored { token as u32 } else { 0 }).collect();
             Ok(SceneClusters::new(assignment, (0..stored as u32).collect())?)
         })
     }),
-    gradient_case("one cluster for all", "a softmax over every token but one", |devices| {
+    StabilityCase::update("one cluster for all", "a softmax over every token but one", |devices| {
         condenser_error(devices, |count| Ok(SceneClusters::new(vec![0; count], vec![count as u32 / 2])?))
     }),
 ];

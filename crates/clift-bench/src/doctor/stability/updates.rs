@@ -5,16 +5,10 @@ use clift_model::{Architecture, CameraEncoding, CliftVariant, CondenserConfig, M
 use clift_train::{ClipShape, Stage, StageBatch, TrainError, freeze, seeded_batch, seeded_model};
 
 use crate::cases::step::update_error;
-use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, RunCase, StabilityCase};
-
-/// Makes a case whose bound is the rounding of f32 through all blocks, forward and backward.
-const fn gradient_case(name: &'static str, breaks: &'static str, run: RunCase) -> StabilityCase {
-    let reason = "f32 through every block, forward and back: 1e-5 a block";
-    StabilityCase { name, breaks, bound: Bound::Most(1e-4), reason, run }
-}
+use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, StabilityCase};
 
 pub(crate) const CASES: &[StabilityCase] = &[
-    gradient_case("identical contexts", "scores of tokens that are equal", |devices| {
+    StabilityCase::update("identical contexts", "scores of tokens that are equal", |devices| {
         changed_views(devices, 4, |clip| {
             let views = &mut clip.context;
             let image = views.images[..views.images.len() / views.c2w.len()].to_vec();
@@ -22,10 +16,10 @@ pub(crate) const CASES: &[StabilityCase] = &[
             views.c2w = vec![views.c2w[0]; views.c2w.len()];
         })
     }),
-    gradient_case("zero baseline: every camera at the origin", "moments that are zero", |devices| {
+    StabilityCase::update("zero baseline: every camera at the origin", "moments that are zero", |devices| {
         changed_views(devices, 4, |clip| move_cameras(clip, |x| 0.0 * x))
     }),
-    gradient_case("cameras 1e-6 apart", "moments that nearly cancel", |devices| {
+    StabilityCase::update("cameras 1e-6 apart", "moments that nearly cancel", |devices| {
         changed_views(devices, 4, |clip| move_cameras(clip, |x| 1e-6 * x))
     }),
     StabilityCase {
@@ -42,27 +36,27 @@ pub(crate) const CASES: &[StabilityCase] = &[
         reason: "scores and values add terms of 1e3 that cancel, twice in each attention; cameras of a clip are within 1",
         run: |devices| relative_views(devices, CameraEncoding::Gta, |clip| shift_cameras(clip, MAX_COORDINATE)),
     },
-    gradient_case("camera-relative attention (gta)", "the transforms of queries, keys and values", |devices| {
+    StabilityCase::update("camera-relative attention (gta)", "the transforms of queries, keys and values", |devices| {
         relative_views(devices, CameraEncoding::Gta, |_| ())
     }),
-    gradient_case(
+    StabilityCase::update(
         "camera-relative attention (prope), field of view of 5 degrees",
         "focal lengths in both",
         |devices| relative_views(devices, CameraEncoding::Prope, |clip| field_of_view(clip, 5.0)),
     ),
-    gradient_case("LVSM's encoder-decoder", "latents among patches, norms of queries and keys", |devices| {
+    StabilityCase::update("LVSM's encoder-decoder", "latents among patches, norms of queries and keys", |devices| {
         lvsm_views(devices, CliftVariant::Paper)
     }),
-    gradient_case("LVSM's encoder-decoder of stock blocks", "latents among patches", |devices| {
+    StabilityCase::update("LVSM's encoder-decoder of stock blocks", "latents among patches", |devices| {
         lvsm_views(devices, CliftVariant::ReleasedRe10k)
     }),
-    gradient_case("field of view of 5 degrees", "rays that are nearly parallel", |devices| {
+    StabilityCase::update("field of view of 5 degrees", "rays that are nearly parallel", |devices| {
         changed_views(devices, 4, |clip| field_of_view(clip, 5.0))
     }),
-    gradient_case("field of view of 150 degrees", "the length of rays at the edge", |devices| {
+    StabilityCase::update("field of view of 150 degrees", "the length of rays at the edge", |devices| {
         changed_views(devices, 4, |clip| field_of_view(clip, 150.0))
     }),
-    gradient_case("target is a context", "scores of a ray with itself", |devices| {
+    StabilityCase::update("target is a context", "scores of a ray with itself", |devices| {
         changed_views(devices, 4, |clip| {
             let len = clip.context.images.len() / clip.context.c2w.len();
             for (target, pose) in clip.target.c2w.iter_mut().enumerate() {
@@ -71,19 +65,27 @@ pub(crate) const CASES: &[StabilityCase] = &[
             }
         })
     }),
-    gradient_case("black images", "patches that are constant, a target at the edge of the sigmoid", |devices| {
-        changed_views(devices, 4, |clip| paint(clip, |_| 0))
-    }),
-    gradient_case("white images", "the same at its other edge", |devices| {
+    StabilityCase::update(
+        "black images",
+        "patches that are constant, a target at the edge of the sigmoid",
+        |devices| changed_views(devices, 4, |clip| paint(clip, |_| 0)),
+    ),
+    StabilityCase::update("white images", "the same at its other edge", |devices| {
         changed_views(devices, 4, |clip| paint(clip, |_| 255))
     }),
-    gradient_case("saturated images: every value 0 or 255", "the largest differences there can be", |devices| {
-        changed_views(devices, 4, |clip| paint(clip, |value| if value > 127 { 255 } else { 0 }))
+    StabilityCase::update(
+        "saturated images: every value 0 or 255",
+        "the largest differences there can be",
+        |devices| changed_views(devices, 4, |clip| paint(clip, |value| if value > 127 { 255 } else { 0 })),
+    ),
+    StabilityCase::update("1 context", "nothing to attend to in other views", |devices| {
+        changed_views(devices, 1, |_| ())
     }),
-    gradient_case("1 context", "nothing to attend to in other views", |devices| changed_views(devices, 1, |_| ())),
-    gradient_case("2 contexts", "sums over more and more tokens", |devices| changed_views(devices, 2, |_| ())),
-    gradient_case("8 contexts", "sums over more and more tokens", |devices| changed_views(devices, 8, |_| ())),
-    gradient_case("16 contexts", "sums over more and more tokens", |devices| changed_views(devices, 16, |_| ())),
+    StabilityCase::update("2 contexts", "sums over more and more tokens", |devices| changed_views(devices, 2, |_| ())),
+    StabilityCase::update("8 contexts", "sums over more and more tokens", |devices| changed_views(devices, 8, |_| ())),
+    StabilityCase::update("16 contexts", "sums over more and more tokens", |devices| {
+        changed_views(devices, 16, |_| ())
+    }),
 ];
 
 /// Share of the largest gradient below which a gradient counts as rounding noise.

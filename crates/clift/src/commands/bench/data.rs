@@ -13,6 +13,7 @@ use crate::commands::args::splits::{Splits, open_splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
 use crate::output::table::table;
+use crate::output::units::{memory_size, seconds};
 
 #[derive(Debug, clap::Args)]
 pub struct BenchDataArgs {
@@ -82,13 +83,13 @@ pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
 fn report_text(report: &Report, [num_context, num_targets]: [usize; 2]) -> String {
     let figures = &report.throughput;
     let Throughput { size: [width, height], num_threads, .. } = figures;
-    let memory = report.peak_bytes.map_or_else(|| "unknown".into(), |bytes| format!("{} MB", bytes / 1_000_000));
+    let memory = report.peak_bytes.map_or_else(|| "unknown".into(), memory_size);
     let rows = [
         ["in order".to_owned(), format!("{:.1} clips/s on {num_threads} threads", figures.sequential_clips_per_s)],
         ["at random".into(), format!("{:.1} clips/s on one thread", figures.random_clips_per_s)],
         [
             "one at random".into(),
-            format!("{:.1} ms (p95: {:.1} ms)", figures.random_median_s * 1e3, figures.random_p95_s * 1e3),
+            format!("{} (p95: {})", seconds(figures.random_median_s), seconds(figures.random_p95_s)),
         ],
         ["peak memory".into(), memory],
     ];

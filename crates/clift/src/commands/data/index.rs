@@ -6,7 +6,6 @@ use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 
 use crate::commands::args::parse::{parse_distance, parse_output};
 use crate::commands::args::splits::{SourceArgs, Splits};
-use crate::exit_code::usage_bail;
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
 

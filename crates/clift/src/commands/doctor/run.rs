@@ -24,7 +24,7 @@ const TOLERANCE_BF16: f64 = 2e-1;
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
         let markdown = args.markdown.as_ref().map(|path| OutputFile::new(path, args.force, &[])).transpose()?;
-        return stability::run(args.small, markdown.as_ref());
+        return stability::run(markdown.as_ref());
     }
     let machine = [("clift", version())].into_iter().chain(machine_rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
@@ -156,9 +156,6 @@ pub struct DoctorArgs {
     /// Run the stability cases instead: hard numerical inputs against f64
     #[arg(long)]
     pub stability: bool,
-    /// Run small versions of the cases: seconds instead of minutes
-    #[arg(long, requires = "stability")]
-    pub small: bool,
     /// Write the table of the cases as Markdown
     #[arg(long, requires = "stability", value_name = "FILE", value_parser = parse_output)]
     pub markdown: Option<PathBuf>,

@@ -7,12 +7,11 @@ use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
 /// Runs every case on every device of the build; fails if an error exceeds its bound.
-pub fn run(is_small: bool, markdown: Option<&OutputFile>) -> anyhow::Result<()> {
+pub fn run(markdown: Option<&OutputFile>) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
-    let size = if is_small { CaseSize::Small } else { CaseSize::Full };
-    let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
+    let rows = run_stability(&devices, CaseSize::Full, &mut |row| print_note(&line(&devices, row)))?;
     if let Some(file) = markdown {
-        let text = format!("{}\n{}\n", markdown_head(is_small), stability_markdown(&devices, &rows));
+        let text = format!("{}\n{}\n", MARKDOWN_HEAD, stability_markdown(&devices, &rows));
         file.write(text.as_bytes())?;
         print_result(&format!("table: {}", file.path().display()))?;
     }
@@ -32,12 +31,9 @@ fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
     format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
 }
 
-fn markdown_head(small: bool) -> String {
-    let command = if small { "clift doctor --stability --small" } else { "clift doctor --stability" };
-    format!(
-        "# Numbers on hard scenes
+const MARKDOWN_HEAD: &str = "# Numbers on hard scenes
 
-Made by `{command} --markdown docs/results/stability.md --force`, with a column for each device of the
+Made by `clift doctor --stability --markdown docs/results/stability.md --force`, with a column for each device of the
 build (`--features ndarray`, `wgpu`); a small version of every case runs in `cargo test --workspace`.
 
 Each case is a real computation in f32, compared with the same code on the same values in f64, which uses the composed
@@ -45,6 +41,4 @@ operations instead of the kernels. The error is the largest difference over the 
 loss and the gradient of every parameter. A gradient below a thousandth of the largest one is compared with that
 thousandth, because a gradient that is zero in exact arithmetic contains only rounding. **Bold** values exceed their
 bound. `refused` cases have an error message and a test of their own.
-"
-    )
-}
+";

@@ -1,15 +1,35 @@
-//! The share of the time of training that is spent waiting for batches.
+//! Measurements of the first steps: the pace of a stage, and the share of the time that is spent waiting for batches.
 
 use std::time::{Duration, Instant};
 
 use clift_data::{DataConfig, SourceKind};
 
-/// Steps that are not counted: the first ones start the threads, and fill the cache of photos.
+/// Steps of a stage after which its pace is reported. The first one is not counted: it may compile kernels.
+const PACE_STEPS: u32 = 20;
+/// Steps that are not counted for the waiting: the first ones start the threads, and fill the cache of photos.
 const FIRST_STEPS: u32 = 50;
 /// Number of counted steps before the judgement.
 const NUM_STEPS: u32 = 50;
 /// Share of the time above which reading limits the speed.
 const MAX_SHARE: f64 = 0.4;
+
+/// Measures the pace of a new stage.
+#[derive(Debug, Default)]
+pub(crate) struct Pace {
+    num_steps: u32,
+    seconds: f64,
+}
+
+impl Pace {
+    /// Counts the wall time of a step with its batch, in seconds. Returns the mean of steps 2 to 20 once, after step 20.
+    pub fn add(&mut self, step_s: f64) -> Option<f64> {
+        self.num_steps = self.num_steps.saturating_add(1);
+        if self.num_steps > 1 {
+            self.seconds += step_s;
+        }
+        (self.num_steps == PACE_STEPS).then(|| self.seconds / f64::from(PACE_STEPS - 1))
+    }
+}
 
 /// Measures the first steps of a process and returns a hint if reading limits their speed.
 #[derive(Debug)]
@@ -57,6 +77,15 @@ fn hint(share: f64, data: &DataConfig) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pace_is_the_mean_without_the_first_step() {
+        let mut pace = Pace::default();
+        let means: Vec<_> = (0..100).map(|step| pace.add(if step == 0 { 1e3 } else { f64::from(step) })).collect();
+        // The mean of 1 to 19.
+        assert_eq!(means.iter().flatten().collect::<Vec<_>>(), [&10.0]);
+        assert_eq!(means[19], Some(10.0));
+    }
 
     #[test]
     fn hint_names_the_keys_once() {

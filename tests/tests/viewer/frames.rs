@@ -1,6 +1,6 @@
-//! Latency, frame rates, idle and closed tabs, shares of two tabs.
+//! Order of frames, idle and closed tabs, and a measurement of the speed.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clift_data::{median, p95};
 
@@ -42,15 +42,10 @@ fn pictures_follow_cameras_and_token_counts_at_once() {
     let viewer = Viewer::start(&["run"], &place.at(""));
     let mut tab = Tab::open(&viewer);
     let stored = tab.scene["stored"].as_u64().expect("a count");
-    let mut over = Vec::new();
     for i in 0..200 {
         let tokens = 1 + i % stored;
-        let picture = tab.picture(tokens);
-        assert_eq!(picture.header["tokens"], tokens, "the next frame has the new count");
-        over.push(picture.latency_ms - picture.render_ms());
+        assert_eq!(tab.picture(tokens).header["tokens"], tokens, "the next frame has the new count");
     }
-    // The 95th percentile is a measurement of `viewer_speed`; here other tests share the cores.
-    assert!(median(&over) < 15.0, "{over:?}");
 }
 
 #[test]
@@ -74,35 +69,18 @@ fn idle_and_closed_tabs_cost_nothing() {
 }
 
 #[test]
-fn two_tabs_get_equal_shares() {
-    let place = Place::with(&WHOLE);
-    let viewer = Viewer::start(&["run"], &place.at(""));
-    let rates: Vec<f64> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..2)
-            .map(|_| {
-                let mut tab = Tab::open(&viewer);
-                scope.spawn(move || tab.frame_rate(1, 2.0))
-            })
-            .collect();
-        threads.into_iter().map(|thread| thread.join().expect("frames")).collect()
-    });
-    let ratio = rates[0] / rates[1];
-    assert!((0.6..1.7).contains(&ratio), "{rates:?} frames per second");
-}
-
-#[test]
-fn a_stalled_tab_gets_two_frames() {
+fn a_stalled_tab_gets_two_frames_and_then_the_latest_camera() {
     let place = Place::with(&WHOLE);
     let viewer = Viewer::start(&["run"], &place.at(""));
     let mut tab = Tab::open(&viewer);
-    for _ in 0..50 {
+    for seq in [1, 2] {
         tab.send_view(1);
-        std::thread::sleep(Duration::from_millis(2));
+        assert_eq!(tab.reply().0["seq"], seq);
     }
-    let seqs = [tab.reply().0, tab.reply().0].map(|header| header["seq"].as_u64().expect("a number"));
-    assert!(seqs[0] < seqs[1] && seqs[1] < 50, "{seqs:?}");
-    let started = Instant::now();
-    tab.send(&serde_json::json!({"type": "ack", "seq": seqs[0]}));
-    assert_eq!(tab.reply().0["seq"], 50, "the latest camera");
-    assert!(started.elapsed() < Duration::from_secs(5));
+    for _ in 2..50 {
+        tab.send_view(1);
+    }
+    // The server reads the cameras before the acknowledgement.
+    tab.send(&serde_json::json!({"type": "ack", "seq": 1}));
+    assert_eq!(tab.reply().0["seq"], 50, "no camera was rendered without acknowledgement");
 }
