@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
+use clift_data::{BadConfig, Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
 use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
@@ -142,8 +142,7 @@ impl BenchContext {
     pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
         let all = self.num_tokens()?;
         let Some(count) = self.render else { return Ok(all) };
-        let bad = |fix: String| TrainError::BadConfig { key: "--render".into(), value: count.to_string(), fix };
-        count.of(all).map_err(|error| bad(error.to_string()))
+        count.of(all).map_err(|error| BadConfig::new("--render", count, error.to_string()).into())
     }
 
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
@@ -154,7 +153,7 @@ impl BenchContext {
     }
 
     pub fn bad_storage(&self, fix: &str) -> TrainError {
-        TrainError::BadConfig { key: "--storage".into(), value: self.storage.to_string(), fix: fix.into() }
+        BadConfig::new("--stored-tokens", self.stored_tokens, fix).into()
     }
 
     pub fn shape(&self) -> ClipShape {

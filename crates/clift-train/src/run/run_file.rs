@@ -265,16 +265,6 @@ mod tests {
     }
 
     #[test]
-    fn run_with_former_names_is_resumed() {
-        let mut tiles = old();
-        tiles.clusters.grouping = clift_model::Grouping::Tile;
-        let text = toml::to_string_pretty(&tiles).unwrap();
-        let former = text.replace("activation_checkpointing", "recompute").replace("\"tile\"", "\"patch\"");
-        assert!(former.contains("recompute = false") && former.contains("grouping = \"patch\""));
-        assert!(differ(&former, &tiles, false).unwrap().is_empty());
-    }
-
-    #[test]
     fn step_counts_grow_only_with_extend() {
         let text = toml::to_string_pretty(&old()).unwrap();
         let mut longer = old();
