@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use clift_data::{
-    BadConfig, ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, median, p95, sample_distinct,
-    uniform_below,
+    BadConfig, ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, median, p95,
+    sample_distinct, uniform_below,
 };
 use serde::Serialize;
 

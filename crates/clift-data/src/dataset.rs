@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use crate::config::DataConfig;
 use crate::bad_config::BadConfig;
+use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::sampling::clip_reader::ClipReader;
 use crate::sampling::training_clips::ReadClip;

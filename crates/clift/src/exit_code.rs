@@ -69,7 +69,11 @@ fn train_exit_code(error: &TrainError) -> u8 {
 }
 
 fn data_exit_code(error: &DataError) -> u8 {
-    if matches!(error, DataError::BadConfig(_) | DataError::BadOutput { .. } | DataError::UnknownLayout { .. }) { USAGE } else { FAILED }
+    if matches!(error, DataError::BadConfig(_) | DataError::BadOutput { .. } | DataError::UnknownLayout { .. }) {
+        USAGE
+    } else {
+        FAILED
+    }
 }
 
 fn eval_exit_code(error: &EvalError) -> u8 {

@@ -282,7 +282,8 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
     let num_targets = eval.num_targets;
     let scene = scene_with_all_tokens(config, eval.num_context, num_targets)?;
-    let counts = config.eval_storage().iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
+    let counts =
+        config.eval_stored_tokens().iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
     // Multiply-accumulates of the encoder, and of all that reads its tokens.
     let encode_and_rest = |model: &ModelConfig| -> Result<(f64, f64), TrainError> {

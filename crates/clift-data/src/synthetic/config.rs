@@ -119,9 +119,12 @@ impl SyntheticConfig {
             "use [fewest, most] up to 100".into()
         })?;
         let [small, large] = self.room_half_size;
-        check_config(small >= 1.0 && large >= small && large <= 100.0, "room_half_size", format!("[{small}, {large}]"), || {
-            "use [smallest, largest] from 1 to 100".into()
-        })?;
+        check_config(
+            small >= 1.0 && large >= small && large <= 100.0,
+            "room_half_size",
+            format!("[{small}, {large}]"),
+            || "use [smallest, largest] from 1 to 100".into(),
+        )?;
         for (key, value, low, high) in [
             ("fov_deg", self.fov_deg, 10.0, 100.0),
             ("path_length", self.path_length, 0.01, 1_000.0),

@@ -10,7 +10,7 @@ use burn::store::ModuleRecord;
 use clift_data::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, first_not_f32};
 
-use crate::checkpoint::progress::{Best, Fingerprint, Progress, STATE, State, VERSION};
+use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};
 use crate::config::config::CheckpointConfig;
 use crate::error::TrainError;
 use crate::step::train_state::TrainState;
@@ -43,7 +43,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`TrainError::Io`]; older checkpoints are then unchanged, and files of this one are removed.
-    pub fn save(&self, train_state: &TrainState, progress: &Progress) -> Result<PathBuf, TrainError> {
+    pub fn save(&self, train_state: &TrainState, progress: &TrainingPosition) -> Result<PathBuf, TrainError> {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
         remove_if_present(&temporary)?;
@@ -60,7 +60,7 @@ impl Checkpoints {
     fn write(
         &self,
         train_state: &TrainState,
-        progress: &Progress,
+        progress: &TrainingPosition,
         temporary: &Path,
         path: &Path,
     ) -> Result<(), TrainError> {
@@ -90,7 +90,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then unchanged.
-    pub fn update(&self, progress: &Progress) -> Result<(), TrainError> {
+    pub fn update(&self, progress: &TrainingPosition) -> Result<(), TrainError> {
         let path = self.path_of(progress.step);
         State { progress: progress.clone(), ..State::read(&path)? }.write(&path)?;
         self.prune(progress)
@@ -100,7 +100,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// As [`load`](Self::load).
-    pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
+    pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<TrainingPosition>, TrainError> {
         let Some(step) = self.newest_step()? else { return Ok(None) };
         // Each save removes unfinished saves, but a finished stage makes no further save.
         self.remove_unfinished()?;
@@ -112,7 +112,7 @@ impl Checkpoints {
     /// # Errors
     /// [`TrainError::Damaged`] for a damaged checkpoint, [`TrainError::BadConfig`] for one of another network,
     /// [`TrainError::Io`] for files that cannot be read.
-    pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<Progress, TrainError> {
+    pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<TrainingPosition, TrainError> {
         load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
             let is_damage = match &source {
                 TrainError::BadFile { .. } => true,
@@ -174,7 +174,7 @@ impl Checkpoints {
         Ok(())
     }
 
-    fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
+    fn prune(&self, progress: &TrainingPosition) -> Result<(), TrainError> {
         self.remove_unfinished()?;
         for step in steps_to_remove(&self.steps()?, &self.retention, progress.best) {
             let path = self.path_of(step);
@@ -213,7 +213,7 @@ fn load_checkpoint(
     folder: &Path,
     expected: Option<&ModelConfig>,
     train_state: &mut TrainState,
-) -> Result<Progress, TrainError> {
+) -> Result<TrainingPosition, TrainError> {
     let bad = |name: &str, reason: String| TrainError::bad_file("checkpoint", &folder.join(name))(reason);
     let State { progress, files, model, loss_scale, .. } = State::read(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
@@ -271,7 +271,8 @@ mod tests {
         let model = clift_model::Clift::new(&config, 0, &device);
         let train_state = TrainState::new(model, &crate::config::config::OptimizerConfig::default(), device);
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
-        let step = checkpoints.save(&train_state, &Progress { step: 1, ..Progress::default() }).unwrap();
+        let step =
+            checkpoints.save(&train_state, &TrainingPosition { step: 1, ..TrainingPosition::default() }).unwrap();
         (train_state, checkpoints, step)
     }
 

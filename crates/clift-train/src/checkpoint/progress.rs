@@ -16,7 +16,7 @@ use crate::step::step_guard::LossHistory;
 
 pub(crate) const STATE: &str = "state.json";
 pub(crate) const VERSION: u32 = 3;
-/// Version with the numbers of [`Progress`] as strings.
+/// Version with the numbers of [`TrainingPosition`] as strings.
 const STRING_VERSION: u32 = 2;
 
 /// Content of `state.json`.
@@ -24,7 +24,7 @@ const STRING_VERSION: u32 = 2;
 #[serde(deny_unknown_fields)]
 pub(crate) struct State {
     pub version: u32,
-    pub progress: Progress,
+    pub progress: TrainingPosition,
     /// Checksums of the other files, by name.
     pub files: BTreeMap<String, Fingerprint>,
     /// Config of the network; absent in the oldest files.
@@ -47,7 +47,7 @@ pub(crate) struct Fingerprint {
 /// and random streams are functions of the seed and the step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Progress {
+pub struct TrainingPosition {
     /// Updates made, including the skipped ones.
     pub step: u64,
     /// Consecutive updates that were skipped just before.
@@ -144,7 +144,8 @@ mod tests {
         for &value in values {
             recent.push(value, -value);
         }
-        let progress = Progress { step: 7, best: Some(Best { step: 5, psnr }), recent, ..Progress::default() };
+        let progress =
+            TrainingPosition { step: 7, best: Some(Best { step: 5, psnr }), recent, ..TrainingPosition::default() };
         State { version: VERSION, progress, files: BTreeMap::new(), model: None, loss_scale: None }
     }
 

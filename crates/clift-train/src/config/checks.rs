@@ -47,7 +47,7 @@ impl Config {
         check_config(is_saved, "checkpoint.keep_every", keep_every, || {
             format!("write 0 or a multiple of checkpoint.every, which is {every}")
         })?;
-        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
+        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.stored_tokens", &eval.stored_tokens)] {
             check_config(!counts.is_empty(), key, "[]", || "write at least one count".into())?;
         }
         let [low, high] = stage1.keep_tokens;
@@ -57,22 +57,14 @@ impl Config {
         keep_tokens(low > 0.0 && low <= high && high <= 1.0, "write 0 < smallest <= largest <= 1")?;
         let all_latents = "the decoder of model.architecture = \"lvsm-ed\" reads all latents: write [1.0, 1.0]";
         keep_tokens(!self.model.has_latents() || low == 1.0, all_latents)?;
-        let (share, line) = (0.0..=1.0, stage2.weight_interpolation);
+        let (half, share) = (stage1.half_resolution, 0.0..=1.0);
+        let (tolerance, factor, weight) =
+            (clusters.kmeans.tolerance, stage2.renderer_lr_factor, stage2.weight_interpolation);
         for (key, value, is_valid, fix) in [
-            ("stage1.half_resolution", stage1.half_resolution, share.contains(&stage1.half_resolution), "write 0 to 1"),
-            (
-                "clusters.kmeans.tolerance",
-                clusters.kmeans.tolerance,
-                (0.0..1.0).contains(&clusters.kmeans.tolerance),
-                "write 0 or a small fraction",
-            ),
-            (
-                "stage2.renderer_lr_factor",
-                stage2.renderer_lr_factor,
-                share.contains(&stage2.renderer_lr_factor),
-                "write 0 to 1",
-            ),
-            ("stage2.weight_interpolation", line, line > 0.0 && line <= 1.0, "write a number above 0, at most 1"),
+            ("stage1.half_resolution", half, share.contains(&half), "write 0 to 1"),
+            ("clusters.kmeans.tolerance", tolerance, (0.0..1.0).contains(&tolerance), "write 0 or a small fraction"),
+            ("stage2.renderer_lr_factor", factor, share.contains(&factor), "write 0 to 1"),
+            ("stage2.weight_interpolation", weight, weight > 0.0 && weight <= 1.0, "write a number above 0, at most 1"),
         ] {
             check_config(is_valid, key, value, || fix.into())?;
         }
@@ -144,7 +136,7 @@ impl Config {
         }
         if self.clusters.grouping == Grouping::Tile {
             let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
-            for (key, count) in grid.chain([("eval.validation_storage", &self.eval.validation_storage)]) {
+            for (key, count) in grid.chain([("eval.validation_stored_tokens", &self.eval.validation_stored_tokens)]) {
                 let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
                 if too_few(views.min_context) || too_few(views.max_context) {
                     return Err(bad(key, count, "write at least one tile for every context view"));
