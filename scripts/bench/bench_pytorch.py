@@ -114,7 +114,7 @@ class Bench:
         # The first step has no optimiser state yet while it goes backward: the second one's memory counts.
         repeats, warmup = (1, 1) if side.contexts else (self.args.repeats, self.args.warmup)
         command = [str(self.clift), "bench", str(self.args.config), "--case", side.work, "--device", "flex"]
-        command += ["--no-error", "--repeats", str(repeats), "--warmup", str(warmup), "--storage", "1/4"]
+        command += ["--no-error", "--repeats", str(repeats), "--warmup", str(warmup), "--stored-tokens", "1/4"]
         size |= {"contexts": side.contexts} if side.contexts else {}
         for override in [*overrides(size, side.is_lvsm), *side.overrides]:
             command += ["--set", override]

@@ -103,7 +103,7 @@ class Bench:
         return [str(self.args.clift), *words, "--device", self.args.device, *sets]
 
     def measure_clift(self, row: Row, precision: str) -> list[float]:
-        command = self.clift("bench", str(self.args.config), "--case", row.work, "--no-error", "--storage", "1/4")
+        command = self.clift("bench", str(self.args.config), "--case", row.work, "--no-error", "--stored-tokens", "1/4")
         command += ["--repeats", str(self.args.repeats), "--warmup", str(self.args.warmup), "--json", str(self.json), "--force"]
         command += ["--set", f'precision="{precision}"']
         command += ["--render", str(row.render_tokens)] if row.render_tokens else []

@@ -75,7 +75,7 @@ class Seed:
         variants = "[" + ",".join(f'"{name}"' for name in VARIANTS.split(",")) + "]"
         self.clift(
             "eval", str(self.run("kmeans").resolve()), "--with", str(self.run("tiles").resolve()),
-            "--storage", STORAGE, "--set", f"eval.variants={variants}", "--out", str(self.compared.resolve()),
+            "--stored-tokens", STORAGE, "--set", f"eval.methods={variants}", "--out", str(self.compared.resolve()),
         )  # fmt: skip
 
     @property

@@ -21,7 +21,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-data",
         "",
-        "error statistics random skip_report files geometry image torch scene_source synthetic sources sampling config \
+        "bad_config error statistics random skip_report files geometry image torch scene_source synthetic sources sampling config \
          tools dataset",
     ),
     (

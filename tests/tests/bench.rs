@@ -54,7 +54,7 @@ fn what_cannot_be_timed_is_wrong_usage() {
     let place = Place::new();
     for (flags, expected) in [
         ("--case encode,incode", &["'incode'", "the cases are encode, kmeans, condense"][..]),
-        ("--storage 17", &["`--storage` = 17"]),
+        ("--stored-tokens 17", &["`--stored-tokens` = 17"]),
         ("--json no/such/folder/bench.json", &["no folder"]),
         ("--set data.width=20", &["`data.width` = 20: write a multiple of model.patch_size = 8"]),
     ] {
@@ -71,11 +71,11 @@ fn features_of_a_file_have_their_own_number_of_tokens() {
     let file = place.at("features.safetensors");
     safetensors::serialize_to_file([("features", view)], None, &file).expect("writable");
     let bench = |cases: &str, storage: usize| {
-        let flags = format!("--case {cases} --repeats 1 --features DIR/features.safetensors --storage {storage}");
+        let flags = format!("--case {cases} --repeats 1 --features DIR/features.safetensors --stored-tokens {storage}");
         place.clift(&format!("{BENCH} {flags}"))
     };
     bench("kmeans", 32).ok();
-    bench("kmeans", 41).fails_with(2, &["`--storage` = 41", "a scene has 40 tokens"]);
+    bench("kmeans", 41).fails_with(2, &["`--stored-tokens` = 41", "a scene has 40 tokens"]);
     bench("kmeans,encode", 32).fails_with(2, &["a scene has 8 tokens; --case kmeans alone uses the tokens of"]);
 }
 

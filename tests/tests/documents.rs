@@ -25,7 +25,7 @@ const SMALLER: [(&str, &str); 9] = [
     ("--distance 45..135", "--distance 4..7"),
     ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
     ("--render 256", "--render 2"),
-    ("--storage 256", "--storage 2"),
+    ("--stored-tokens 256", "--stored-tokens 2"),
 ];
 
 /// Keys of a config whose training takes a second on six frames.
@@ -48,8 +48,8 @@ const SMALL_RUN: [&str; 24] = [
     "stage1.accumulate=1",
     "stage2.batch_size=2",
     "stage2.accumulate=1",
-    "eval.storage=[0.5]",
-    "eval.validation_storage=0.5",
+    "eval.stored_tokens=[0.5]",
+    "eval.validation_stored_tokens=0.5",
     "eval.num_scenes=1",
     "eval.num_context=2",
     "eval.num_targets=2",
@@ -291,7 +291,7 @@ fn prepare(base: &Path) {
         let run_dir = format!("run_dir={run}");
         clift(&["train", config.to_str().expect("text"), "--set", &run_dir, "--set", key]);
     };
-    train("runs/tiny", "eval.tokens=['f32', 'int8']");
+    train("runs/tiny", "eval.formats=['f32', 'int8']");
     train("runs/re10k", SMALL_DATA);
     // An example replaces PATH.
     train("runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR"));

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use clift_data::{
-    ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, median, p95, sample_distinct,
-    uniform_below,
+    BadConfig, ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, median, p95,
+    sample_distinct, uniform_below,
 };
 use serde::Serialize;
 
@@ -68,7 +68,7 @@ pub fn measure_reading(source: &Arc<dyn SceneSource>, options: &ThroughputOption
         [("num_clips", num_clips), ("num_context", options.num_views[0]), ("num_scenes", source.num_scenes())]
     {
         if value == 0 {
-            return Err(DataError::bad_config(key, "is 0; at least 1 is needed"));
+            return Err(BadConfig::new(key, 0, "use at least 1").into());
         }
     }
     let reader = ClipReader { source: Arc::clone(source), options: clip };

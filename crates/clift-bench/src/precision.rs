@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_data::median;
+use clift_data::{BadConfig, median};
 use clift_eval::psnr_of_mse;
 use clift_model::{DeviceName, Precision};
 use clift_train::{Config, Stage, TrainError, freeze};
@@ -72,7 +72,7 @@ pub fn compare_precision(
 ) -> Result<PrecisionReport, TrainError> {
     if let Some(other) = options.cases.iter().find(|case| !PRECISION_CASES.contains(case)) {
         let fix = format!("write some of {}", PRECISION_CASES.map(BenchCase::name).join(", "));
-        return Err(TrainError::BadConfig { key: "--case".into(), value: other.name().into(), fix });
+        return Err(BadConfig::new("--case", other.name(), fix).into());
     }
     let precision = if config.precision == Precision::F32 { Precision::F16 } else { config.precision };
     let context = |precision| BenchContext::new(&Config { precision, ..config.clone() }, options);

@@ -192,8 +192,8 @@ pub(crate) mod tests {
     }
 
     pub fn options(cases: &[BenchCase]) -> BenchOptions {
-        let storage = TokenCount::Share(0.25);
-        BenchOptions { repeats: 2, error: true, storage, ..BenchOptions::new(cases.into()) }
+        let stored_tokens = TokenCount::Share(0.25);
+        BenchOptions { repeats: 2, error: true, stored_tokens, ..BenchOptions::new(cases.into()) }
     }
 
     #[test]
@@ -229,13 +229,14 @@ pub(crate) mod tests {
     fn scenes_may_be_absent_but_sizes_must_fit() {
         let mut config = config(DeviceName::Flex);
         config.data.source = clift_data::SourceKind::Chunks;
-        let prepared = |config: &Config, storage: &str| {
-            let storage = storage.parse().expect("a count");
-            BenchContext::new(config, &BenchOptions { storage, ..options(&[]) }).map(|context| context.num_tokens())
+        let prepared = |config: &Config, stored: &str| {
+            let stored_tokens = stored.parse().expect("a count");
+            BenchContext::new(config, &BenchOptions { stored_tokens, ..options(&[]) })
+                .map(|context| context.num_tokens())
         };
         assert_eq!(prepared(&config, "16").expect("valid").expect("whole patches"), 16);
         let message = prepared(&config, "17").err().map(|error| error.to_string());
-        assert_eq!(message.as_deref(), Some("`--storage` = 17: `17` tokens: a scene has 16 tokens"));
+        assert_eq!(message.as_deref(), Some("`--stored-tokens` = 17: `17` tokens: a scene has 16 tokens"));
         config.model.num_heads = 3;
         assert!(prepared(&config, "1/4").is_err());
     }
@@ -245,7 +246,7 @@ pub(crate) mod tests {
         let mut config = config(DeviceName::Flex);
         (config.data.width, config.data.height) = (448, 256);
         config.stage1.batch_size = 64;
-        let options = BenchOptions { storage: TokenCount::Count(448), ..options(&[]) };
+        let options = BenchOptions { stored_tokens: TokenCount::Count(448), ..options(&[]) };
         let context = BenchContext::new(&config, &options).expect("valid");
         assert_eq!(context.num_tokens().expect("whole patches"), 7168);
         let reduced = context.reduced().expect("valid");

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use crate::bad_config::BadConfig;
 use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::sampling::clip_reader::ClipReader;
@@ -47,7 +48,7 @@ fn open_files(
     split: Split,
     progress: ScanProgress<'_>,
 ) -> Result<OpenedSource, DataError> {
-    let missing = |key: &str, fix: &str| DataError::bad_config(key, format!("is missing; {fix}"));
+    let missing = |key: &str, fix: &str| BadConfig::new(key, "missing", fix);
     let root = config.root.as_deref();
     let root = root.ok_or_else(|| missing("data.root", "write the folder of the data set or capture"))?;
     let (filters, files) = (config.filters.clone(), config.files.clone());
@@ -66,7 +67,7 @@ fn open_files(
     if split == Split::Train && !is_divided && (opened.kind == SourceKind::Dl3dv || has_dl3dv()) {
         let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write \
                    the path of an evaluation index or of a file with one key per line (an empty file excludes none)";
-        return Err(missing("data.files.test_scenes", fix));
+        return Err(missing("data.files.test_scenes", fix).into());
     }
     if opened.shares_scenes {
         opened.report.notes.push(match config.hold_out {

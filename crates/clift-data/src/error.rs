@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::bad_config::BadConfig;
+
 /// Error of this crate. A message states the problem, the expected and the found value, and the path last.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -194,13 +196,8 @@ pub enum DataError {
         source: Box<DataError>,
     },
     /// A configuration value is invalid.
-    #[error("{key} {problem}")]
-    BadConfig {
-        /// Dotted key, relative to its table.
-        key: String,
-        /// Value, problem and remedy, as a verb phrase ("is 0; use at least 1").
-        problem: String,
-    },
+    #[error(transparent)]
+    BadConfig(#[from] BadConfig),
     /// A scene has too few frames for the views to sample.
     #[error("not enough frames: {needed} needed, {got} in the scene")]
     NotEnoughFrames {
@@ -255,11 +252,6 @@ pub struct WorkerPanic {
 }
 
 impl DataError {
-    /// Creates a [`DataError::BadConfig`].
-    pub fn bad_config(key: impl Into<String>, problem: impl Into<String>) -> Self {
-        Self::BadConfig { key: key.into(), problem: problem.into() }
-    }
-
     /// Returns a function that names the frame of an error, for `map_err`.
     pub(crate) fn in_frame(key: &str, frame: usize) -> impl FnOnce(Self) -> Self {
         move |source| Self::InFrame { key: key.to_owned(), frame, source: Box::new(source) }
@@ -269,9 +261,4 @@ impl DataError {
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
-}
-
-/// Returns a [`DataError::BadConfig`] unless the value of `key` is valid.
-pub(crate) fn check_config(is_valid: bool, key: &str, problem: impl FnOnce() -> String) -> Result<(), DataError> {
-    if is_valid { Ok(()) } else { Err(DataError::bad_config(key, problem())) }
 }

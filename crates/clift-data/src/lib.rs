@@ -16,6 +16,7 @@
 //! # Ok::<(), clift_data::DataError>(())
 //! ```
 
+mod bad_config;
 mod config;
 mod dataset;
 mod error;
@@ -35,6 +36,7 @@ mod tools;
 mod torch;
 
 // Opening a data set.
+pub use bad_config::{BadConfig, check_config};
 pub use config::DataConfig;
 pub use dataset::{half_resolution_clips, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};

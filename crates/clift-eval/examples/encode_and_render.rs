@@ -37,7 +37,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let options = EncodeOptions {
         context: None,
         num_context: 4,
-        storage: TokenCount::Share(0.25),
+        stored_tokens: TokenCount::Share(0.25),
         grouping: Grouping::Kmeans,
         kmeans: KMeans::default(),
         seed: 0,

@@ -18,7 +18,7 @@ pub struct EncodeOptions {
     /// Number of context views without `context`, such as the number in training.
     pub num_context: usize,
     /// Number of stored tokens.
-    pub storage: TokenCount,
+    pub stored_tokens: TokenCount,
     /// Token groups that the model was trained on.
     pub grouping: Grouping,
     /// Latent K-means.
@@ -92,15 +92,15 @@ pub fn encode(
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
     let clusters = if model.config.has_latents() {
-        if options.storage.of(num_lift_tokens)? != num_lift_tokens {
+        if options.stored_tokens.of(num_lift_tokens)? != num_lift_tokens {
             let fix =
                 format!("a scene of lvsm-ed is all its latents, which are not clustered: write {num_lift_tokens}");
-            return Err(bad_config("--storage", options.storage.to_string(), fix));
+            return Err(bad_config("--stored-tokens", options.stored_tokens.to_string(), fix));
         }
         SceneClusters::identity(num_lift_tokens)
     } else {
         let grid = [data.height, data.width].map(|side| side / model.config.patch_size);
-        let (count, kmeans) = (options.storage.of(num_lift_tokens)?, (&options.kmeans, seed));
+        let (count, kmeans) = (options.stored_tokens.of(num_lift_tokens)?, (&options.kmeans, seed));
         options.grouping.group(count, (clip.context.num_views(), grid), kmeans, || lift.values.clone())?
     };
     let cluster_error = clusters.variance_within(&host_values(&lift)?);

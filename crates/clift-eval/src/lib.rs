@@ -62,7 +62,7 @@ pub use config::token_selection::Selection;
 // A complete evaluation with its files.
 pub use evaluator::evaluator::{Evaluator, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
-pub use evaluator::progress::{Process, Progress, SharedScenes};
+pub use evaluator::progress::{EvalProgress, Process, SharedScenes};
 pub use report::page::RunDescription;
 pub use report::training::TrainingCurve;
 

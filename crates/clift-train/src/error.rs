@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_data::BadConfig;
+
 /// An error of this crate. Messages have the problem, the value found, the remedy, and the path last.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -17,15 +19,8 @@ pub enum TrainError {
         path: PathBuf,
     },
     /// A value of the configuration is invalid.
-    #[error("`{key}` = {value}: {fix}")]
-    BadConfig {
-        /// Dotted key, as in the TOML file.
-        key: String,
-        /// The value found.
-        value: String,
-        /// What to write instead.
-        fix: String,
-    },
+    #[error(transparent)]
+    BadConfig(#[from] BadConfig),
     /// The run directory contains a run with other settings.
     #[error(
         "this run was started with other settings:\n{differences}\nresume with the old values, {or}set another `run_dir`, or \
@@ -222,5 +217,5 @@ impl TrainError {
 }
 
 pub(crate) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
-    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
+    BadConfig::new(key, value, fix).into()
 }

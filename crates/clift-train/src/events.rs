@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_eval::{EvalError, Process, Progress, SharedScenes};
+use clift_eval::{EvalError, EvalProgress, Process, SharedScenes};
 use serde::{Deserialize, Serialize};
 
 use crate::distributed::ranks::Ranks;
@@ -173,7 +173,7 @@ pub(crate) struct EvalEvents<'a> {
     pub is_stage: bool,
 }
 
-impl Progress for EvalEvents<'_> {
+impl EvalProgress for EvalEvents<'_> {
     fn done(&mut self, scenes: usize, total: usize) {
         let (stage, done, total) = (Stage::Eval, scenes as u64, total as u64);
         match (self.is_stage, done) {

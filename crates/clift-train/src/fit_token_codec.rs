@@ -47,7 +47,7 @@ pub fn fit_token_codec(
     let eval = EvalConfig { index: None, num_scenes: 0, num_targets, ..config.eval.clone() };
     let (items, ..) = evaluation_items(&eval, reader, frames)?;
     let options = CodecOptions {
-        counts: eval.storage,
+        counts: eval.stored_tokens,
         kmeans: config.clusters.kmeans.clone(),
         seed: derive_seed(config.seed, "codec"),
     };

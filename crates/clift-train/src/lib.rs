@@ -69,7 +69,7 @@ pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};
 // Results of the stages
 pub use checkpoint::checkpoints::Checkpoints;
-pub use checkpoint::progress::Progress;
+pub use checkpoint::progress::TrainingPosition;
 pub use cluster_cache::cache::ClusterCache;
 // Published checkpoints
 pub use interchange::export::{ExportFormat, Exported, export};

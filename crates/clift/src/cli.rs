@@ -73,7 +73,7 @@ External methods:
   letters, digits, - _ and . are replaced by _.
 
 Examples:
-  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8 --out runs/tiny/formats
+  clift eval runs/tiny --stored-tokens 8,1/4,1.0 --format f32,f16,int8 --out runs/tiny/formats
   clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"' --out lpips
   clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB --force")]
     Eval(EvalArgs),
@@ -103,8 +103,8 @@ Examples:
   clift encode captures/attic -o attic.clift
   clift encode runs/tiny --scene synthetic-0-test-00000 -o room.clift
   clift encode runs/re10k captures/attic -o attic.clift
-  clift encode runs/re10k /data/re10k --scene 5aca87f95a9412c6 --storage 1/8 -o room.clift
-  clift encode runs/re10k /data/re10k/test --storage 256 --tokens coded -o room.clift
+  clift encode runs/re10k /data/re10k --scene 5aca87f95a9412c6 --stored-tokens 1/8 -o room.clift
+  clift encode runs/re10k /data/re10k/test --stored-tokens 256 --format coded -o room.clift
   clift encode runs/re10k captures/attic --size-kb 20 -o attic.clift")]
     Encode(EncodeArgs),
     /// Fit the token codec of a model, for coded scene files
@@ -227,7 +227,7 @@ mod tests {
     fn completion_scripts_of_all_shells_have_the_commands() {
         for shell in clap_complete::Shell::value_variants() {
             let script = completions::script(*shell, Args::command());
-            assert!(["encode", "convert", "storage"].iter().all(|word| script.contains(word)), "{shell}");
+            assert!(["encode", "convert", "stored-tokens"].iter().all(|word| script.contains(word)), "{shell}");
         }
     }
 

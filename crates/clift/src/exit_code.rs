@@ -1,7 +1,8 @@
 //! Error messages and exit codes.
 
+use clift_data::{BadConfig, DataError};
 use clift_eval::EvalError;
-use clift_train::TrainError;
+use clift_train::{ConfigError, TrainError};
 use clift_view::ViewError;
 
 use crate::interrupt;
@@ -34,10 +35,10 @@ macro_rules! usage_bail {
 pub(crate) use usage_bail;
 
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
-    if error.is::<UsageError>() || error.is::<clift_train::ConfigError>() {
+    if error.is::<UsageError>() || error.is::<ConfigError>() || error.is::<BadConfig>() {
         return USAGE;
     }
-    if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
+    if let Some(error) = error.downcast_ref::<DataError>() {
         return data_exit_code(error);
     }
     if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
@@ -55,7 +56,7 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
 fn train_exit_code(error: &TrainError) -> u8 {
     match error {
         TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
-        TrainError::BadConfig { .. }
+        TrainError::BadConfig(_)
         | TrainError::OtherRun { .. }
         | TrainError::Missing { .. }
         | TrainError::NoMpi { .. } => USAGE,
@@ -67,9 +68,12 @@ fn train_exit_code(error: &TrainError) -> u8 {
     }
 }
 
-fn data_exit_code(error: &clift_data::DataError) -> u8 {
-    use clift_data::DataError::{BadConfig, BadOutput, UnknownLayout};
-    if matches!(error, BadConfig { .. } | BadOutput { .. } | UnknownLayout { .. }) { USAGE } else { FAILED }
+fn data_exit_code(error: &DataError) -> u8 {
+    if matches!(error, DataError::BadConfig(_) | DataError::BadOutput { .. } | DataError::UnknownLayout { .. }) {
+        USAGE
+    } else {
+        FAILED
+    }
 }
 
 fn eval_exit_code(error: &EvalError) -> u8 {
@@ -133,7 +137,7 @@ mod tests {
         assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), USAGE);
         assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
         assert_eq!(exit_code(&TrainError::Abandoned { task: "timing `encode`".into() }.into()), 130);
-        assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
+        assert_eq!(exit_code(&DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
         assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
     }
 }

@@ -28,7 +28,7 @@ impl Setup {
         clift(&["train", &micro, "--set", &run_dir])?;
         for storage in ["f32", "f16", "int8", "coded"] {
             let out = text(&place(&format!("room-{storage}.clift")));
-            let scene = ["--scene", "synthetic-0-test-00000", "--tokens", storage, "-o", &out];
+            let scene = ["--scene", "synthetic-0-test-00000", "--format", storage, "-o", &out];
             clift(&[&["encode", &text(&run)], &scene[..]].concat())?;
         }
         let (config, _) = read_config(&run.join("config.toml"), &[])?;

@@ -65,9 +65,10 @@ fn the_shipped_model_encodes_photos_and_is_small() {
 fn dl3dv_training_requires_a_test_scene_list() {
     let place = Place::new();
     for source in ["dl3dv", "auto", "captures"] {
-        place
-            .train("run", &[&data(source, "dl3dv", "")])
-            .fails_with(2, &["data.files.test_scenes is missing; the folders also hold the benchmark scenes of DL3DV"]);
+        place.train("run", &[&data(source, "dl3dv", "")]).fails_with(
+            2,
+            &["`data.files.test_scenes` = missing: the folders also hold the benchmark scenes of DL3DV"],
+        );
     }
     place.write("none.txt", "");
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());

@@ -54,7 +54,7 @@ fn published_checkpoints_import_evaluate_encode_and_render() {
         let stored: Vec<_> = list(&summary["points"]).iter().map(|point| &point["num_storage_tokens"]).collect();
         assert_eq!(stored, [1, 3, 6, 12, 18, 24]);
         let data = "REPO/data-fixtures/re10k-mini --scene 00000000000000b1";
-        place.clift(&format!("encode {model} {data} -o DIR/{name}.clift --storage 1/2 {SMALL}")).ok();
+        place.clift(&format!("encode {model} {data} -o DIR/{name}.clift --stored-tokens 1/2 {SMALL}")).ok();
         place.clift(&format!("render DIR/{name}.clift --path interpolate --frames 3 -o DIR/{name}-frames")).ok();
         assert!(place.at(&format!("{name}-frames/frame-00002.png")).exists());
     }
@@ -83,8 +83,8 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
     write_state_dict(&place.at("first.ckpt"), &first, &[]).unwrap();
     let first = import(&place, "DIR/first.ckpt", "released-re10k", "3", "first");
     assert_eq!(variants(&evaluate(&place, &first, "a", "")), ["kmeans", "random"].into());
-    let alone = evaluate(&place, &first, "a", "--storage 6");
-    let both = evaluate(&place, &model, "b", &format!("--stage1 {first} --storage 6"));
+    let alone = evaluate(&place, &first, "a", "--stored-tokens 6");
+    let both = evaluate(&place, &model, "b", &format!("--stage1 {first} --stored-tokens 6"));
     assert_eq!(variants(&both), ["clift", "kmeans", "random"].into());
     let psnr = |summary: &serde_json::Value| number(point(list(&summary["points"]), "kmeans", 6), "psnr");
     assert_eq!(psnr(&alone), psnr(&both), "the first stage's own renderer draws them");
@@ -204,7 +204,7 @@ fn checkpoints_not_imported_are_refused_with_the_command() {
 fn an_evaluation_without_the_published_index_says_so() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "model");
-    let words = format!("eval --checkpoint {model} {DATA} --out DIR/eval --force --storage 6 {SMALL}");
+    let words = format!("eval --checkpoint {model} {DATA} --out DIR/eval --force --stored-tokens 6 {SMALL}");
     let note = "published figures use an evaluation index";
     place.clift(&format!("{words} --set eval.num_context=2")).ok().notes(note);
     let ran = place.clift(&format!("{words} {INDEX}")).ok();

@@ -15,7 +15,7 @@ fn encode(place: &Place, flags: &str) -> crate::support::Ran {
 #[test]
 fn coded_files_have_the_size_and_quality_of_the_evaluation() {
     let place = Place::with(&LONGER);
-    place.eval("run --tokens f32,coded,coded-1 --set eval.num_scenes=1 --out DIR/coded").ok();
+    place.eval("run --format f32,coded,coded-1 --set eval.num_scenes=1 --out DIR/coded").ok();
     let points = place.points("coded");
     let of = |tokens: &str, count: usize| {
         let is_it = |point: &&serde_json::Value| {
@@ -26,7 +26,9 @@ fn coded_files_have_the_size_and_quality_of_the_evaluation() {
     encode(&place, "").ok().prints("(clift, coded, expected loss 0.02 dB)");
     for tokens in ["coded", "coded-1"] {
         for count in [4, 8] {
-            encode(&place, &format!("--storage {count} --tokens {tokens}")).ok().prints("(clift, coded, expected loss");
+            encode(&place, &format!("--stored-tokens {count} --format {tokens}"))
+                .ok()
+                .prints("(clift, coded, expected loss");
             let bytes = place.bytes("room.clift").len() as u64;
             assert_eq!(of(tokens, count)["scene_bytes"], bytes, "{tokens}, {count}");
             let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
@@ -46,7 +48,7 @@ fn steps_are_chosen_for_a_loss_or_a_size() {
     let place = Place::with(&LONGER);
     let mut sizes = Vec::new();
     for loss in ["0.001", "0.02", "3"] {
-        encode(&place, &format!("--storage 8 --quality {loss} --save-clusters DIR/clusters.json"))
+        encode(&place, &format!("--stored-tokens 8 --quality {loss} --save-clusters DIR/clusters.json"))
             .ok()
             .prints("measured loss");
         sizes.push(place.bytes("room.clift").len());
@@ -56,14 +58,14 @@ fn steps_are_chosen_for_a_loss_or_a_size() {
     let centroids: Vec<u32> =
         list(&place.json("clusters.json")["centroids"]).iter().map(|id| id.as_u64().unwrap() as u32).collect();
     assert_eq!(centroids, Scene::read(&place.at("room.clift")).unwrap().0.token_ids);
-    for (kb, flags) in [("0.58", ""), ("0.65", "--storage 8")] {
+    for (kb, flags) in [("0.58", ""), ("0.65", "--stored-tokens 8")] {
         encode(&place, &format!("--size-kb {kb} {flags}")).ok();
         let (size, asked) = (place.bytes("room.clift").len() as f64, 1e3 * kb.parse::<f64>().unwrap());
         assert!(size <= asked && size >= 0.95 * asked, "{size} bytes of {asked}");
     }
     encode(&place, "--size-kb 0.2").fails_with(2, &["`--size-kb` = 0.200", "the least size of"]);
     for flags in
-        ["--size-kb 1 --quality 1", "--tokens f16 --quality 1", "--quality 0", "--size-kb -1", "--tokens coded-0"]
+        ["--size-kb 1 --quality 1", "--format f16 --quality 1", "--quality 0", "--size-kb -1", "--format coded-0"]
     {
         encode(&place, flags).fails(2);
     }
@@ -79,10 +81,10 @@ fn codecs_are_fitted_again_alike_and_models_without_one_have_a_remedy() {
     // Training goes on where it was killed: after the weights, before the codec.
     std::fs::remove_file(place.at(CODEC)).unwrap();
     std::fs::remove_dir_all(place.at("run/eval")).unwrap();
-    encode(&place, "--tokens coded").fails_with(2, &["no token codec at ", "fit it with `clift codec"]);
+    encode(&place, "--format coded").fails_with(2, &["no token codec at ", "fit it with `clift codec"]);
     place
-        .eval("run --tokens coded --out DIR/none")
-        .fails_with(2, &["`eval.tokens` = coded: the model has no token codec"]);
+        .eval("run --format coded --out DIR/none")
+        .fails_with(2, &["`eval.formats` = coded: the model has no token codec"]);
     place.eval("run --preset main --out DIR/main").ok().notes("coded tokens are left out");
     place.train("run", &[]).ok();
     assert_eq!(place.bytes(CODEC), codec);
@@ -90,26 +92,26 @@ fn codecs_are_fitted_again_alike_and_models_without_one_have_a_remedy() {
     let mut other = TokenCodec::read(&place.at(CODEC)).unwrap();
     other.renderer_hash = "0".repeat(64);
     other.write(&place.at(CODEC)).unwrap();
-    encode(&place, "--tokens coded").fails_with(1, &["the codec was fitted to other weights; fit it again"]);
+    encode(&place, "--format coded").fails_with(1, &["the codec was fitted to other weights; fit it again"]);
 
     let place = Place::with(&STAGE_1);
     assert!(!place.at("run/stage1/codec.safetensors").exists());
     place.clift("codec DIR/run").ok();
-    encode(&place, "--tokens coded").ok().prints("(kmeans, coded");
+    encode(&place, "--format coded").ok().prints("(kmeans, coded");
     place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/out").ok();
 }
 
 #[test]
 fn codecs_are_exported_and_imported() {
     let place = Place::with(&WHOLE);
-    encode(&place, "--tokens coded").ok();
+    encode(&place, "--format coded").ok();
     place.clift("export DIR/run --format pytorch -o DIR/micro.ckpt").ok();
     assert_eq!(place.bytes("micro.codec.safetensors"), place.bytes(CODEC));
     place.clift("import DIR/micro.ckpt --variant paper -o DIR/imported").ok();
     assert_eq!(place.bytes("imported/codec.safetensors"), place.bytes(CODEC));
     place.clift("render DIR/room.clift --path orbit --frames 2 --model DIR/imported -o DIR/out").ok();
     // Scenes of the codec that is replaced.
-    place.clift("codec DIR/run --force --set eval.storage=[0.5]").ok();
+    place.clift("codec DIR/run --force --set eval.stored_tokens=[0.5]").ok();
     let expected = ["the scene was coded with the codec ", "give the run it was encoded with"];
     place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/again").fails_with(1, &expected);
 }

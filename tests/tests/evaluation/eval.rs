@@ -58,7 +58,7 @@ pub fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) 
 #[test]
 fn every_format_and_count_has_speed_and_fronts() {
     let place = Place::with(&WHOLE);
-    let ran = place.eval("run --tokens f32,f16,int8 --render 1/2 --out DIR/formats").ok();
+    let ran = place.eval("run --format f32,f16,int8 --render 1/2 --out DIR/formats").ok();
     ran.prints("t: no other point has a higher PSNR");
     let points = place.points("formats");
     let of = |variant: &str, format: &str| {

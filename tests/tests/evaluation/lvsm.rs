@@ -40,11 +40,11 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
     place.copy(&FIVE, "five");
     let three = [&LVSM[..1], &["model.num_latents=3"], &LVSM[2..]].concat();
     place.train("three", &three).ok();
-    let words = "run --preset main --storage 1/2 --with DIR/five --with DIR/three --out DIR/out";
+    let words = "run --preset main --stored-tokens 1/2 --with DIR/five --with DIR/three --out DIR/out";
     place.eval(words).ok().prints("lvsm_ed").prints("values");
     let points = place.points("out");
     assert_eq!(points.len(), 5, "f16 and two coded of CLiFT, two sizes of LVSM: {points:?}");
-    place.eval("five --tokens f16").ok();
+    place.eval("five --format f16").ok();
     for (name, count) in [("five", 5), ("three", 3)] {
         let found = point(&points, "lvsm_ed", count);
         assert_eq!(
@@ -72,7 +72,7 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
 fn latents_are_stored_and_rendered_whole() {
     let place = Place::with(&FIVE);
     let encode = "encode DIR/run --scene synthetic-0-test-00000 -o DIR/room.clift";
-    let encoded = place.clift(&format!("{encode} --tokens f32")).ok().prints("5 of 5 tokens (latents, f32)");
+    let encoded = place.clift(&format!("{encode} --format f32")).ok().prints("5 of 5 tokens (latents, f32)");
     assert!(!encoded.stdout.contains("clusters"), "{}", encoded.stdout);
     place.clift("render DIR/room.clift --path interpolate --frames 3 -o DIR/frames").ok().prints("5 of 5 tokens");
     place.clift("export DIR/run --format f16 -o DIR/half").ok();
@@ -84,9 +84,9 @@ fn latents_are_stored_and_rendered_whole() {
     place.clift("view DIR/room.clift --no-open").fails_with(2, &["latents of lvsm-ed lie nowhere"]);
     place.clift("export DIR/run --format pytorch -o DIR/a.pt").fails_with(2, &["write --format f16"]);
     for (flags, part) in [
-        ("--storage 2", "not clustered: write 5"),
+        ("--stored-tokens 2", "not clustered: write 5"),
         ("--save-clusters DIR/clusters.json", "not clustered"),
-        ("--tokens coded", "have no codec"),
+        ("--format coded", "have no codec"),
     ] {
         place.clift(&format!("{encode} --force {flags}")).fails_with(2, &[part]);
     }

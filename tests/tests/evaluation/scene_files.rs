@@ -80,7 +80,7 @@ fn scene_files_reproduce_the_evaluation() {
     for (count, format) in [4, 8].into_iter().flat_map(|count| TokenFormat::ALL.map(|format| (count, format))) {
         let storage = format.name();
         let name = format!("{count}-{storage}.clift");
-        let flags = format!("--context 0,7 --storage {count} --tokens {storage}");
+        let flags = format!("--context 0,7 --stored-tokens {count} --format {storage}");
         let ran = place.clift(&format!("{ENCODE} DIR/{name} {flags}")).ok();
         ran.prints(&format!("{count} of 8 tokens (clift, {storage})"));
 
@@ -91,7 +91,7 @@ fn scene_files_reproduce_the_evaluation() {
         let bytes = place.bytes(&name).len() as u64;
         assert_eq!(bytes, 8 + 2048 + 136 + 164 * 2 + (count * (28 + format.bytes_per_token(16))) as u64);
         assert_eq!(bytes, scene.file_bytes(format));
-        place.eval(&format!("run --tokens {storage} --out DIR/{storage}")).ok();
+        place.eval(&format!("run --format {storage} --out DIR/{storage}")).ok();
         assert_eq!(point(&place.points(storage), "clift", count)["scene_bytes"], bytes);
 
         // Images from the file equal those of the evaluation in memory to the last digit, at every format.
@@ -126,7 +126,7 @@ fn evaluation_of_selected_tokens_equals_rendering_the_file() {
     for run in [&LONGER, &RELATIVE] {
         let place = Place::with(run);
         let (clip, _) = first_clip(&place);
-        place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 4 --tokens f32")).ok();
+        place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --stored-tokens 4 --format f32")).ok();
         for &preset in SelectionPreset::ALL {
             let name = preset.name();
             place.eval(&format!("run --render 3,1/2 --selection {name} --out DIR/{name}")).ok();
@@ -148,7 +148,7 @@ fn camera_relative_networks_have_no_published_form() {
 #[test]
 fn paths_render_to_frames_and_animation_by_count() {
     let place = Place::with(&WHOLE);
-    place.clift(&format!("{ENCODE} DIR/room.clift --storage 1.0 --tokens f16")).ok();
+    place.clift(&format!("{ENCODE} DIR/room.clift --stored-tokens 1.0 --format f16")).ok();
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
     assert_eq!((scene.num_tokens(), storage), (8, TokenCoding::F16));
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
@@ -208,7 +208,7 @@ fn paths_render_to_frames_and_animation_by_count() {
 fn what_cannot_be_drawn_says_what_to_do() {
     let place = Place::with(&WHOLE);
     place.train("other --only stage1", &["seed=1"]).ok();
-    place.clift(&format!("{ENCODE} DIR/room.clift --tokens f16")).ok();
+    place.clift(&format!("{ENCODE} DIR/room.clift --format f16")).ok();
     let render = |flags: &str| place.clift(&format!("render DIR/room.clift --out DIR/out {flags}"));
     let orbit = "--path orbit --frames 2";
     let no_path = "--path interpolated: no such file; write interpolate, orbit or";
@@ -274,8 +274,8 @@ fn scene_files_overwrite_only_scene_files() {
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
     encode("no/room.clift").fails_with(2, &["no folder "]);
     encode("room.clift").ok();
-    encode("room.clift --storage 8").fails_with(2, &["room.clift exists; replace it with --force"]);
-    encode("room.clift --storage 8 --force").ok();
+    encode("room.clift --stored-tokens 8").fails_with(2, &["room.clift exists; replace it with --force"]);
+    encode("room.clift --stored-tokens 8 --force").ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
     // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
@@ -287,8 +287,9 @@ fn scene_files_overwrite_only_scene_files() {
 #[test]
 fn encode_compares_a_frame_that_is_no_context() {
     let place = Place::with(&LONGER);
-    let encode =
-        |flags: &str| place.clift(&format!("{ENCODE} DIR/room.clift --tokens f32 --storage 8 {flags} --force")).ok();
+    let encode = |flags: &str| {
+        place.clift(&format!("{ENCODE} DIR/room.clift --format f32 --stored-tokens 8 {flags} --force")).ok()
+    };
     let ran = encode("--context 0,7");
     let check = ran.stdout.lines().find(|line| line.starts_with("check: frame 3, not a context: ")).expect("a check");
     let decibels: Vec<f64> = check.split(' ').filter_map(|word| word.parse().ok()).collect();
@@ -330,12 +331,12 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     encode("--scene attic").fails_with(2, &["no scene attic; the "]);
     let one = |flags: &str| encode(&format!("--scene {KEY} {flags}"));
     one("--context 0,8").fails_with(2, &["`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"]);
-    one("--storage 9").fails_with(2, &["a scene has 8 tokens"]);
+    one("--stored-tokens 9").fails_with(2, &["a scene has 8 tokens"]);
 
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
-    let ran = one("--storage 8 --context 0,7").ok().prints("8 of 8 tokens (kmeans, f16)");
+    let ran = one("--stored-tokens 8 --context 0,7").ok().prints("8 of 8 tokens (kmeans, f16)");
     ran.prints("     8  0.0000\ncheck: frame 3, not a context: ");
-    one("--storage 1/2 --save-clusters DIR/clusters.json").ok().prints("4 of 8 tokens");
+    one("--stored-tokens 1/2 --save-clusters DIR/clusters.json").ok().prints("4 of 8 tokens");
     let clusters = place.json("clusters.json");
     assert_eq!((list(&clusters["assignment"]).len(), list(&clusters["centroids"]).len()), (8, 4));
     assert_eq!((&clusters["rows"], &clusters["columns"]), (&2.into(), &2.into()));

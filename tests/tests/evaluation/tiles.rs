@@ -3,7 +3,7 @@
 use crate::support::{Place, WHOLE, list, number, point};
 
 /// At least one tile per view.
-const STORAGE: &str = "eval.validation_storage=0.5";
+const STORAGE: &str = "eval.validation_stored_tokens=0.5";
 
 /// Trains stage 2 of the run `tiles` on tiles, from the stage 1 of `run`.
 fn train_on_tiles(place: &Place) {
@@ -15,7 +15,7 @@ fn train_on_tiles(place: &Place) {
 fn tiles_and_clusters_have_paired_differences() {
     let place = Place::with(&WHOLE);
     train_on_tiles(&place);
-    let words = "run --preset patchwise --with DIR/tiles --storage 1/2 --out DIR/out";
+    let words = "run --preset patchwise --with DIR/tiles --stored-tokens 1/2 --out DIR/out";
     place.eval(words).ok().prints("kmeans - tile").prints("tile_clift");
     let summary = place.json("out/summary.json");
     let points = list(&summary["points"]);
@@ -45,11 +45,11 @@ fn tile_runs_encode_scenes_and_refuse_their_kind() {
     train_on_tiles(&place);
     place
         .train("few", &["clusters.grouping=\"tile\""])
-        .fails_with(2, &["eval.validation_storage", "at least one tile for every context view"]);
+        .fails_with(2, &["eval.validation_stored_tokens", "at least one tile for every context view"]);
     place.eval("run --with DIR/run").fails_with(2, &["trained on the same groups of tokens"]);
-    let patchwise = place.eval("run --preset patchwise --storage 1/2");
+    let patchwise = place.eval("run --preset patchwise --stored-tokens 1/2");
     patchwise.fails_with(2, &["clusters.grouping = \"tile\"", "--with"]);
-    let encode = "encode DIR/tiles --scene synthetic-0-test-00000 --storage 4 -o DIR/room.clift";
+    let encode = "encode DIR/tiles --scene synthetic-0-test-00000 --stored-tokens 4 -o DIR/room.clift";
     place.clift(encode).ok().prints("variance within clusters");
     place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/orbit").ok();
     place.clift("codec DIR/tiles").fails_with(2, &["clusters.grouping", "the token codec is one of K-means tokens"]);

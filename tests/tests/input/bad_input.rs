@@ -80,8 +80,8 @@ fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
 #[test]
 fn what_the_data_refutes_is_refused_before_any_step() {
     let place = Place::new();
-    let expected = "`eval.storage` = 9: write at most 8, the fewest tokens of an evaluated scene";
-    place.train("run", &["eval.storage=[9]"]).fails_with(2, &[expected]);
+    let expected = "`eval.stored_tokens` = 9: write at most 8, the fewest tokens of an evaluated scene";
+    place.train("run", &["eval.stored_tokens=[9]"]).fails_with(2, &[expected]);
     assert!(!place.at("run/metrics.jsonl").exists());
     let nowhere = place.at("nowhere");
     train_on(&place, "run", &nowhere, &[]).fails_naming(1, &[], &nowhere.display().to_string());

@@ -151,7 +151,7 @@ fn moved_runs_evaluate_with_other_counts() {
     assert_eq!(place.summary_but_time("after"), summary);
     assert!(!place.at("before").exists(), "nothing is written to where the run was trained");
 
-    place.eval("after --storage 3,1/2 --set eval.num_scenes=2 --out DIR/elsewhere").ok();
+    place.eval("after --stored-tokens 3,1/2 --set eval.num_scenes=2 --out DIR/elsewhere").ok();
     let other = place.json("elsewhere/summary.json");
     assert_eq!(other["num_scenes"], 2);
     let stored: Vec<_> = list(&other["points"]).iter().map(|point| &point["num_storage_tokens"]).collect();

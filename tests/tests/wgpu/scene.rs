@@ -58,7 +58,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let options = EncodeOptions {
         context: None,
         num_context: config.data.views.max_context,
-        storage: TokenCount::Count(STORED),
+        stored_tokens: TokenCount::Count(STORED),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
+use clift_data::{BadConfig, Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
 use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
@@ -30,7 +30,7 @@ pub struct BenchOptions {
     /// Whether results are compared with f64.
     pub error: bool,
     /// Stored tokens of a scene.
-    pub storage: TokenCount,
+    pub stored_tokens: TokenCount,
     /// Tokens from which a view is rendered; `None` for all of a scene.
     pub render: Option<TokenCount>,
     /// Input of K-means: a safetensors file with the tensor `features`, `[N, D]` in f32; `None` for the encoder's tokens.
@@ -40,8 +40,8 @@ pub struct BenchOptions {
 impl BenchOptions {
     /// One timed repetition of each case, without warm-up and f64 check, with all tokens stored.
     pub fn new(cases: Vec<BenchCase>) -> Self {
-        let storage = TokenCount::Share(1.0);
-        Self { cases, repeats: 1, warmup: 0, error: false, storage, render: None, features: None }
+        let stored_tokens = TokenCount::Share(1.0);
+        Self { cases, repeats: 1, warmup: 0, error: false, stored_tokens, render: None, features: None }
     }
 }
 
@@ -52,7 +52,7 @@ pub struct BenchContext {
     pub device: Device,
     /// Whether tensors are in the memory of this process.
     pub is_cpu: bool,
-    storage: TokenCount,
+    stored_tokens: TokenCount,
     render: Option<TokenCount>,
     pub features: Option<PathBuf>,
     /// Tokens of one scene, computed once.
@@ -73,7 +73,7 @@ impl BenchContext {
         let context = Self {
             device,
             is_cpu: config.device.is_cpu(),
-            storage: options.storage,
+            stored_tokens: options.stored_tokens,
             render: options.render,
             features: options.features.clone(),
             lift: OnceCell::new(),
@@ -88,8 +88,8 @@ impl BenchContext {
     }
 
     fn with(&self, config: Config) -> Self {
-        let (device, is_cpu, storage) = (self.device.clone(), self.is_cpu, self.storage);
-        Self { config, device, is_cpu, storage, render: None, features: None, lift: OnceCell::new() }
+        let (device, is_cpu, stored_tokens) = (self.device.clone(), self.is_cpu, self.stored_tokens);
+        Self { config, device, is_cpu, stored_tokens, render: None, features: None, lift: OnceCell::new() }
     }
 
     /// Returns the small network of `stage1_step_tiny`: 256 tokens, 64 target patches, batch 8 for every config.
@@ -126,8 +126,8 @@ impl BenchContext {
         stage1.batch_size = stage1.batch_size.min(num_scenes);
         stage2.batch_size = stage2.batch_size.min(num_scenes);
         let mut reduced = self.with(config);
-        if let TokenCount::Count(count) = self.storage {
-            reduced.storage = TokenCount::Share(count as f64 / self.num_tokens()? as f64);
+        if let TokenCount::Count(count) = self.stored_tokens {
+            reduced.stored_tokens = TokenCount::Share(count as f64 / self.num_tokens()? as f64);
         }
         Ok(reduced)
     }
@@ -144,19 +144,18 @@ impl BenchContext {
     pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
         let all = self.num_tokens()?;
         let Some(count) = self.render else { return Ok(all) };
-        let bad = |fix: String| TrainError::BadConfig { key: "--render".into(), value: count.to_string(), fix };
-        count.of(all).map_err(|error| bad(error.to_string()))
+        count.of(all).map_err(|error| BadConfig::new("--render", count, error.to_string()).into())
     }
 
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
-        self.storage.of(num_tokens).map_err(|error| {
+        self.stored_tokens.of(num_tokens).map_err(|error| {
             let hint = if self.features.is_some() { "; --case kmeans alone uses the tokens of --features" } else { "" };
-            self.bad_storage(&format!("{error}{hint}"))
+            self.bad_stored_tokens(&format!("{error}{hint}"))
         })
     }
 
-    pub fn bad_storage(&self, fix: &str) -> TrainError {
-        TrainError::BadConfig { key: "--storage".into(), value: self.storage.to_string(), fix: fix.into() }
+    pub fn bad_stored_tokens(&self, fix: &str) -> TrainError {
+        BadConfig::new("--stored-tokens", self.stored_tokens, fix).into()
     }
 
     pub fn shape(&self) -> ClipShape {

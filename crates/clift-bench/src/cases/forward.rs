@@ -88,7 +88,7 @@ pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward<Attention
     let (count, dim) = (context.num_storage_tokens()?, context.config.model.dim);
     let num_members = context.num_tokens()? - count;
     if num_members == 0 {
-        return Err(context.bad_storage("all tokens are stored, which leaves no cluster members: store fewer"));
+        return Err(context.bad_stored_tokens("all tokens are stored, which leaves no cluster members: store fewer"));
     }
     // Logits with a deviation of about one: sqrt(3) makes uniform values of unit variance.
     let random = |rows: usize, columns: usize, purpose: &str| {

@@ -1,6 +1,7 @@
 //! The scene of every batch slot: a function of (seed, step, slot) alone.
 
-use crate::error::{DataError, check_config};
+use crate::bad_config::check_config;
+use crate::error::DataError;
 use crate::random::{derive_seed, mix};
 
 /// Rounds of the Feistel network behind [`SceneOrder`]. Four suffice in theory; more cost nothing.
@@ -22,7 +23,7 @@ pub struct SceneOrder {
 impl SceneOrder {
     pub fn new(seed: u64, num_scenes: usize, batch_size: usize) -> Result<Self, DataError> {
         for (key, value) in [("num_scenes", num_scenes), ("batch_size", batch_size)] {
-            check_config(value > 0, key, || "is 0; at least 1 is needed".into())?;
+            check_config(value > 0, key, 0, || "use at least 1".into())?;
         }
         let num_scenes = num_scenes as u64;
         let bits = (u64::BITS - (num_scenes - 1).leading_zeros()).max(2);

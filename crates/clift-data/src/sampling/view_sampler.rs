@@ -4,7 +4,8 @@ use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::error::{DataError, check_config};
+use crate::bad_config::{BadConfig, check_config};
+use crate::error::DataError;
 use crate::random::{sample_from, step_rng, uniform_below, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
@@ -70,32 +71,34 @@ impl ViewSampler {
     /// Checks that a long enough scene has views for every allowed number of contexts.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] with the first invalid field.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// The first invalid field.
+    pub fn validate(&self) -> Result<(), BadConfig> {
         let Self { min_context, max_context, min_gap, max_gap, num_targets, .. } = *self;
-        check_config(min_context >= 2, "min_context", || format!("is {min_context}; use 2 or more"))?;
-        check_config(max_context >= min_context, "max_context", || {
-            format!("is {max_context}; use min_context = {min_context} or more")
+        check_config(min_context >= 2, "min_context", min_context, || "use 2 or more".into())?;
+        check_config(max_context >= min_context, "max_context", max_context, || {
+            format!("use min_context = {min_context} or more")
         })?;
-        check_config(num_targets > 0, "num_targets", || "is 0; use 1 or more".into())?;
+        check_config(num_targets > 0, "num_targets", 0, || "use 1 or more".into())?;
         for (key, count) in [("max_context", max_context), ("num_targets", num_targets)] {
-            check_config(count <= MAX_VIEWS, key, || format!("is {count}; use {MAX_VIEWS} or fewer"))?;
+            check_config(count <= MAX_VIEWS, key, count, || format!("use {MAX_VIEWS} or fewer"))?;
         }
         for (key, gap) in [("min_gap", min_gap), ("max_gap", max_gap)] {
-            check_config(gap[0] <= gap[1], key, || format!("is {gap:?}; the second value must be at least the first"))?;
+            check_config(gap[0] <= gap[1], key, format!("{gap:?}"), || {
+                "the second value must be at least the first".into()
+            })?;
         }
-        check_config(max_gap[0] >= min_gap[0] && max_gap[1] >= min_gap[1], "max_gap", || {
-            format!("is {max_gap:?}; use at least min_gap = {min_gap:?}")
+        check_config(max_gap[0] >= min_gap[0] && max_gap[1] >= min_gap[1], "max_gap", format!("{max_gap:?}"), || {
+            format!("use at least min_gap = {min_gap:?}")
         })?;
         for num_context in min_context..=max_context {
             let num_frames = min_gap[0] / self.gap_divisor(num_context) + 1;
-            check_config(num_frames >= num_context, "min_gap", || {
+            check_config(num_frames >= num_context, "min_gap", format!("{min_gap:?}"), || {
                 let needed = (num_context - 1) * self.gap_divisor(num_context);
-                format!("is {min_gap:?}; {num_context} distinct contexts need a gap of {needed} or more")
+                format!("{num_context} distinct contexts need a gap of {needed} or more")
             })?;
-            check_config(self.with_replacement || num_frames >= num_targets, "num_targets", || {
+            check_config(self.with_replacement || num_frames >= num_targets, "num_targets", num_targets, || {
                 let gap = num_frames - 1;
-                format!("is {num_targets}; a gap of {gap} has {num_frames} frames, so use fewer or with_replacement")
+                format!("a gap of {gap} has {num_frames} frames, so use fewer or with_replacement")
             })?;
         }
         Ok(())
@@ -156,8 +159,8 @@ impl ViewSampler {
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
         let Self { min_context, max_context, .. } = *self;
-        check_config((min_context..=max_context).contains(&num_context), "num_context", || {
-            format!("is {num_context}; use {min_context} to {max_context}")
+        check_config((min_context..=max_context).contains(&num_context), "num_context", num_context, || {
+            format!("use {min_context} to {max_context}")
         })?;
         let [min_gap, max_gap] = self.gap_bounds(step, num_context);
         if num_frames <= min_gap {
@@ -195,7 +198,7 @@ pub fn sample_targets(
     rng: &mut impl Rng,
 ) -> Result<Vec<usize>, DataError> {
     let (Some(&first), Some(&last)) = (context.iter().min(), context.iter().max()) else {
-        return Err(DataError::bad_config("context", "is empty; use 1 or more frames"));
+        return Err(BadConfig::new("context", "[]", "use 1 or more frames").into());
     };
     if last >= num_frames {
         return Err(DataError::NotEnoughFrames { needed: last + 1, got: num_frames });

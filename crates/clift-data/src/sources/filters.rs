@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{DataError, check_config};
+use crate::bad_config::{BadConfig, check_config};
+use crate::error::DataError;
 
 /// Filters of the scenes of a data set. Skipped scenes are listed in the skip report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -18,11 +19,11 @@ impl SceneFilters {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] with the invalid field.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// The invalid field.
+    pub fn validate(&self) -> Result<(), BadConfig> {
         let Some(limit) = self.max_fov_deg else { return Ok(()) };
-        check_config(limit.is_finite() && limit > 0.0, "max_fov_deg", || {
-            format!("is {limit}; use a positive number such as 100")
+        check_config(limit.is_finite() && limit > 0.0, "max_fov_deg", limit, || {
+            "use a positive number such as 100".into()
         })
     }
 

@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use crate::bad_config::BadConfig;
 use crate::error::DataError;
 use crate::files::caches::cache_folder;
 use crate::files::listing::file_names;
@@ -75,7 +76,7 @@ pub(crate) fn scan_source(
     progress: ScanProgress<'_>,
 ) -> Result<OpenedSource, DataError> {
     if options.kind == SourceKind::Synthetic {
-        return Err(DataError::bad_config("source", "is synthetic; use the layout of the folder, or auto"));
+        return Err(BadConfig::new("source", "synthetic", "use the layout of the folder, or auto").into());
     }
     let list = options.files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
     // With an empty list, both splits are the same scenes.

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{DataError, check_config};
+use crate::bad_config::{BadConfig, check_config};
 use crate::scene_source::Split;
 
 /// Largest number of scenes of one source: the table of key blocks stays below 1 MiB.
@@ -97,24 +97,27 @@ impl SyntheticConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] with the first field out of range.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// The first field out of range.
+    pub fn validate(&self) -> Result<(), BadConfig> {
         for (key, count, most) in [
             ("num_scenes", self.num_scenes, MAX_SCENES),
             ("num_frames", self.num_frames, 100_000),
             ("width", self.width, 16_384),
             ("height", self.height, 16_384),
         ] {
-            check_config((1..=most).contains(&count), key, || format!("is {count}; use 1 to {most}"))?;
+            check_config((1..=most).contains(&count), key, count, || format!("use 1 to {most}"))?;
         }
         let [fewest, most] = self.num_objects;
-        check_config(fewest <= most && most <= 100, "num_objects", || {
-            format!("is [{fewest}, {most}]; use [fewest, most] up to 100")
+        check_config(fewest <= most && most <= 100, "num_objects", format!("[{fewest}, {most}]"), || {
+            "use [fewest, most] up to 100".into()
         })?;
         let [small, large] = self.room_half_size;
-        check_config(small >= 1.0 && large >= small && large <= 100.0, "room_half_size", || {
-            format!("is [{small}, {large}]; use [smallest, largest] from 1 to 100")
-        })?;
+        check_config(
+            small >= 1.0 && large >= small && large <= 100.0,
+            "room_half_size",
+            format!("[{small}, {large}]"),
+            || "use [smallest, largest] from 1 to 100".into(),
+        )?;
         for (key, value, low, high) in [
             ("fov_deg", self.fov_deg, 10.0, 100.0),
             ("path_length", self.path_length, 0.01, 1_000.0),
@@ -122,33 +125,34 @@ impl SyntheticConfig {
             ("plain_share", self.plain_share, 0.0, 1.0),
             ("specular", self.specular, 0.0, 1.0),
         ] {
-            check_config((low..=high).contains(&value), key, || format!("is {value}; use {low} to {high}"))?;
+            check_config((low..=high).contains(&value), key, value, || format!("use {low} to {high}"))?;
         }
         if self.look == Look::Real {
             self.check_unset()?;
         }
         let samples = self.samples_per_pixel;
         let is_square = samples.isqrt().pow(2) == samples;
-        check_config((1..=256).contains(&samples) && is_square, "samples_per_pixel", || {
-            format!("is {samples}; use a square number such as 1, 4, 9 or 16")
+        check_config((1..=256).contains(&samples) && is_square, "samples_per_pixel", samples, || {
+            "use a square number such as 1, 4, 9 or 16".into()
         })
     }
 
     /// Checks that no key is set that has a meaning for rooms only.
-    fn check_unset(&self) -> Result<(), DataError> {
-        let unset = Self::default();
-        for (key, is_unset) in [
-            ("fov_deg", self.fov_deg == unset.fov_deg),
-            ("room_half_size", self.room_half_size == unset.room_half_size),
-            ("num_objects", self.num_objects == unset.num_objects),
-            ("looks", self.looks == unset.looks),
-            ("path_length", self.path_length == unset.path_length),
-            ("texture_frequency", self.texture_frequency == unset.texture_frequency),
-            ("plain_share", self.plain_share == unset.plain_share),
-            ("specular", self.specular == unset.specular),
-            ("samples_per_pixel", self.samples_per_pixel == unset.samples_per_pixel),
+    fn check_unset(&self) -> Result<(), BadConfig> {
+        let [own, unset] = [self, &Self::default()].map(|config| serde_json::to_value(config).unwrap_or_default());
+        for key in [
+            "fov_deg",
+            "room_half_size",
+            "num_objects",
+            "looks",
+            "path_length",
+            "texture_frequency",
+            "plain_share",
+            "specular",
+            "samples_per_pixel",
         ] {
-            check_config(is_unset, key, || "is set, but look = \"real\" does not use it; remove it".to_owned())?;
+            let fix = || "look = \"real\" does not use it: remove the key".into();
+            check_config(own[key] == unset[key], key, &own[key], fix)?;
         }
         Ok(())
     }
@@ -162,25 +166,25 @@ mod tests {
     fn invalid_value_is_named_with_its_key() {
         type Change = fn(&mut SyntheticConfig);
         let cases: [(Change, &str); 19] = [
-            (|c| c.num_frames = 0, "num_frames is 0; use 1 to 100000"),
-            (|c| c.num_scenes = MAX_SCENES + 1, "num_scenes is 32000001"),
-            (|c| c.width = 0, "width is 0"),
-            (|c| c.height = 20_000, "height is 20000"),
-            (|c| c.fov_deg = f64::NAN, "fov_deg is NaN"),
-            (|c| c.fov_deg = f64::INFINITY, "fov_deg is inf"),
-            (|c| c.room_half_size = [2.0, 1.0], "room_half_size is [2, 1]"),
-            (|c| c.room_half_size = [0.5, 1.0], "room_half_size is [0.5, 1]"),
-            (|c| c.room_half_size = [f64::NAN, 2.0], "room_half_size is [NaN, 2]"),
-            (|c| c.room_half_size = [1.5, f64::INFINITY], "room_half_size is [1.5, inf]"),
-            (|c| c.num_objects = [4, 2], "num_objects is [4, 2]"),
-            (|c| c.path_length = 0.0, "path_length is 0"),
-            (|c| c.path_length = f64::INFINITY, "path_length is inf"),
-            (|c| c.texture_frequency = -1.0, "texture_frequency is -1"),
-            (|c| c.texture_frequency = f64::NAN, "texture_frequency is NaN"),
-            (|c| c.plain_share = 1.5, "plain_share is 1.5"),
-            (|c| c.specular = 1.5, "specular is 1.5"),
-            (|c| c.specular = f64::NEG_INFINITY, "specular is -inf"),
-            (|c| c.samples_per_pixel = 6, "samples_per_pixel is 6"),
+            (|c| c.num_frames = 0, "`num_frames` = 0: use 1 to 100000"),
+            (|c| c.num_scenes = MAX_SCENES + 1, "`num_scenes` = 32000001"),
+            (|c| c.width = 0, "`width` = 0"),
+            (|c| c.height = 20_000, "`height` = 20000"),
+            (|c| c.fov_deg = f64::NAN, "`fov_deg` = NaN"),
+            (|c| c.fov_deg = f64::INFINITY, "`fov_deg` = inf"),
+            (|c| c.room_half_size = [2.0, 1.0], "`room_half_size` = [2, 1]"),
+            (|c| c.room_half_size = [0.5, 1.0], "`room_half_size` = [0.5, 1]"),
+            (|c| c.room_half_size = [f64::NAN, 2.0], "`room_half_size` = [NaN, 2]"),
+            (|c| c.room_half_size = [1.5, f64::INFINITY], "`room_half_size` = [1.5, inf]"),
+            (|c| c.num_objects = [4, 2], "`num_objects` = [4, 2]"),
+            (|c| c.path_length = 0.0, "`path_length` = 0"),
+            (|c| c.path_length = f64::INFINITY, "`path_length` = inf"),
+            (|c| c.texture_frequency = -1.0, "`texture_frequency` = -1"),
+            (|c| c.texture_frequency = f64::NAN, "`texture_frequency` = NaN"),
+            (|c| c.plain_share = 1.5, "`plain_share` = 1.5"),
+            (|c| c.specular = 1.5, "`specular` = 1.5"),
+            (|c| c.specular = f64::NEG_INFINITY, "`specular` = -inf"),
+            (|c| c.samples_per_pixel = 6, "`samples_per_pixel` = 6"),
         ];
         for (change, expected) in cases {
             let mut config = SyntheticConfig::default();
@@ -195,7 +199,7 @@ mod tests {
         let real: SyntheticConfig = serde_json::from_str(r#"{"look": "real", "num_frames": 32}"#).unwrap();
         real.validate().unwrap();
         let message = SyntheticConfig { fov_deg: 60.0, ..real }.validate().unwrap_err().to_string();
-        assert!(message.starts_with("fov_deg is set, but look = \"real\" does not use it; remove it"), "{message}");
+        assert!(message.starts_with("`fov_deg` = 60.0: look = \"real\" does not use it"), "{message}");
         assert!(!serde_json::to_string(&SyntheticConfig::default()).unwrap().contains("\"look\""));
     }
 

@@ -6,7 +6,8 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::error::{DataError, check_config};
+use crate::bad_config::{BadConfig, check_config};
+use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::geometry::overlap::overlap;
 use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
@@ -50,26 +51,25 @@ impl OverlapOptions {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] with the first invalid field.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// The first invalid field.
+    pub fn validate(&self) -> Result<(), BadConfig> {
         let Self { num_context, num_targets, distance: [near, far], min_overlap, .. } = *self;
-        check_config((2..=10_000).contains(&num_context), "num_context", || {
-            format!("is {num_context}; use 2 or more")
-        })?;
+        check_config((2..=10_000).contains(&num_context), "num_context", num_context, || "use 2 or more".into())?;
         let least = num_context - usize::from(self.context_targets);
-        check_config(far >= near, "distance", || format!("is {near} to {far}; write the smaller number first"))?;
-        check_config(near >= least, "distance", || {
-            format!("is {near} to {far}; {num_context} contexts and a target need a gap of {least} or more")
+        let distance = format!("{near} to {far}");
+        check_config(far >= near, "distance", &distance, || "write the smaller number first".into())?;
+        check_config(near >= least, "distance", distance, || {
+            format!("{num_context} contexts and a target need a gap of {least} or more")
         })?;
         let (most, frames) = if self.context_targets {
             (near + 1, "the frames of the smallest gap")
         } else {
             (near + 1 - num_context, "the frames of the smallest gap that are no contexts")
         };
-        check_config((1..=most).contains(&num_targets), "num_targets", || {
-            format!("is {num_targets}; use 1 to {most}, {frames}")
+        check_config((1..=most).contains(&num_targets), "num_targets", num_targets, || {
+            format!("use 1 to {most}, {frames}")
         })?;
-        check_config((0.0..=1.0).contains(&min_overlap), "min_overlap", || format!("is {min_overlap}; use 0 to 1"))
+        check_config((0.0..=1.0).contains(&min_overlap), "min_overlap", min_overlap, || "use 0 to 1".into())
     }
 
     /// Samples the views of a scene, or returns the reason for the skip report.
@@ -267,16 +267,16 @@ mod tests {
     fn invalid_option_is_named() {
         let valid = OverlapOptions::default;
         for (options, expected) in [
-            (OverlapOptions { num_context: 1, ..valid() }, "num_context is 1"),
-            (OverlapOptions { num_targets: 0, ..valid() }, "num_targets is 0"),
-            (OverlapOptions { num_targets: 43, ..valid() }, "num_targets is 43; use 1 to 42, "),
-            (OverlapOptions { num_targets: 47, ..valid() }, "num_targets is 47"),
+            (OverlapOptions { num_context: 1, ..valid() }, "`num_context` = 1"),
+            (OverlapOptions { num_targets: 0, ..valid() }, "`num_targets` = 0"),
+            (OverlapOptions { num_targets: 43, ..valid() }, "`num_targets` = 43: use 1 to 42, "),
+            (OverlapOptions { num_targets: 47, ..valid() }, "`num_targets` = 47"),
             (
                 OverlapOptions { distance: [2, 9], ..valid() },
-                "distance is 2 to 9; 4 contexts and a target need a gap of 4 or more",
+                "`distance` = 2 to 9: 4 contexts and a target need a gap of 4 or more",
             ),
-            (OverlapOptions { distance: [9, 8], ..valid() }, "distance is 9 to 8"),
-            (OverlapOptions { min_overlap: f64::NAN, ..valid() }, "min_overlap is NaN"),
+            (OverlapOptions { distance: [9, 8], ..valid() }, "`distance` = 9 to 8"),
+            (OverlapOptions { min_overlap: f64::NAN, ..valid() }, "`min_overlap` = NaN"),
         ] {
             let message = options.validate().unwrap_err().to_string();
             assert!(message.starts_with(expected), "{message}");

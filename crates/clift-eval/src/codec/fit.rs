@@ -14,7 +14,7 @@ use clift_model::{
 use rand::RngExt;
 
 use crate::error::EvalError;
-use crate::evaluator::progress::Progress;
+use crate::evaluator::progress::EvalProgress;
 use crate::metrics::image_metrics::psnr_of_mse;
 use crate::sweep::compressed_tokens::with_values;
 use crate::upload::{host_values, upload_cameras, upload_views};
@@ -68,7 +68,7 @@ pub fn fit_codec(
     reader: &ClipReader,
     items: &[EvaluationItem],
     options: &CodecOptions,
-    progress: &mut dyn Progress,
+    progress: &mut dyn EvalProgress,
 ) -> Result<FittedCodec, EvalError> {
     let num_fitted = items.len().min(MAX_FITTED_SCENES);
     let measured = &items[..items.len().min(MAX_MEASURED_SCENES)];
@@ -150,7 +150,7 @@ struct Fit<'a> {
     model: &'a TrainedModel,
     reader: &'a ClipReader,
     options: &'a CodecOptions,
-    progress: &'a mut dyn Progress,
+    progress: &'a mut dyn EvalProgress,
     done: usize,
     total: usize,
 }

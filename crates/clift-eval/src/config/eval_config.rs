@@ -14,7 +14,7 @@ use crate::config::token_selection::Selection;
 #[serde(deny_unknown_fields, default)]
 pub struct EvalConfig {
     /// Token counts of the stored scenes.
-    pub storage: Vec<TokenCount>,
+    pub stored_tokens: Vec<TokenCount>,
     /// Token counts of a rendered view, numbers or shares of the stored tokens, beside all stored tokens. Below the
     /// stored count, tokens are selected for every view.
     pub render: Vec<TokenCount>,
@@ -22,11 +22,11 @@ pub struct EvalConfig {
     pub selection: Selection,
     /// Rendered methods of `random`, `tile`, `tile_clift`, `kmeans`, `clift` and `lvsm_ed`; empty for all methods with
     /// weights.
-    pub variants: Vec<Method>,
-    /// Storage of the tokens, as in a scene file: one of `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss as
+    pub methods: Vec<Method>,
+    /// Formats of the stored tokens, as in a scene file: one of `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss as
     /// measured when the codec was fitted) and `coded-DB`, or a list of them to compare.
     #[serde(deserialize_with = "one_or_more")]
-    pub tokens: Vec<TokenCoding>,
+    pub formats: Vec<TokenCoding>,
     /// LPIPS weights, converted by `scripts/tools/convert_vgg.py`. LPIPS is not measured without weights.
     pub lpips_weights: Option<PathBuf>,
     /// Evaluation index with the context and target frames of every scene. Without an index, contexts are spread evenly
@@ -47,7 +47,7 @@ pub struct EvalConfig {
     /// Scenes of a validation.
     pub num_validation_scenes: usize,
     /// Token count of a stage-2 validation.
-    pub validation_storage: TokenCount,
+    pub validation_stored_tokens: TokenCount,
     /// Precision of matrix products in encoder, condenser and renderer: `f32`, `bf16` or `f16`. K-means is always f32.
     pub precision: Precision,
 }
@@ -62,7 +62,7 @@ impl EvalConfig {
 /// Reads a format or a list of formats, without duplicates.
 fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenCoding>, D::Error> {
     #[derive(Deserialize)]
-    #[serde(untagged, expecting = "a storage (\"f32\", \"f16\", \"int8\", \"coded\") or a list of them")]
+    #[serde(untagged, expecting = "a format (\"f32\", \"f16\", \"int8\", \"coded\") or a list of them")]
     enum Written {
         One(TokenCoding),
         More(Vec<TokenCoding>),
@@ -84,11 +84,11 @@ impl Default for EvalConfig {
         // The shares of the paper's main experiment.
         let shares = [1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0];
         Self {
-            storage: shares.map(TokenCount::Share).into(),
+            stored_tokens: shares.map(TokenCount::Share).into(),
             render: Vec::new(),
             selection: Selection::default(),
-            variants: Vec::new(),
-            tokens: vec![TokenCoding::F32],
+            methods: Vec::new(),
+            formats: vec![TokenCoding::F32],
             lpips_weights: None,
             index: None,
             drop_context_targets: false,
@@ -98,7 +98,7 @@ impl Default for EvalConfig {
             num_sheets: 4,
             every: 0,
             num_validation_scenes: 4,
-            validation_storage: TokenCount::Share(0.125),
+            validation_stored_tokens: TokenCount::Share(0.125),
             precision: Precision::F32,
         }
     }
@@ -110,11 +110,11 @@ mod tests {
 
     #[test]
     fn formats_are_a_name_or_a_list() {
-        let tokens = |text: &str| serde_json::from_str::<EvalConfig>(text).map(|config| config.tokens);
-        assert_eq!(tokens(r#"{"tokens": "f16"}"#).unwrap(), [TokenCoding::F16]);
-        assert_eq!(tokens(r#"{"tokens": ["int8", "f32", "int8"]}"#).unwrap(), [TokenCoding::INT8, TokenCoding::F32]);
-        assert!(tokens(r#"{"tokens": []}"#).unwrap_err().to_string().contains("at least one"));
-        assert!(tokens(r#"{"tokens": "f64"}"#).unwrap_err().to_string().contains("int8"));
+        let formats = |text: &str| serde_json::from_str::<EvalConfig>(text).map(|config| config.formats);
+        assert_eq!(formats(r#"{"formats": "f16"}"#).unwrap(), [TokenCoding::F16]);
+        assert_eq!(formats(r#"{"formats": ["int8", "f32", "int8"]}"#).unwrap(), [TokenCoding::INT8, TokenCoding::F32]);
+        assert!(formats(r#"{"formats": []}"#).unwrap_err().to_string().contains("at least one"));
+        assert!(formats(r#"{"formats": "f64"}"#).unwrap_err().to_string().contains("int8"));
     }
 
     #[test]

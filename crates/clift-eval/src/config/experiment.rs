@@ -29,7 +29,7 @@ impl Experiment {
     /// Counts are shares, valid for other numbers of tokens than the paper's 4,096. The patch-wise table has 256 and 1,024
     /// of 4,096 tokens; the table of render budgets stores 4,096 of 8,192 tokens and renders 4,096 to 512.
     pub fn apply(self, eval: &mut EvalConfig) {
-        let (storage, render, methods): (&[f64], &[f64], &[Method]) = match self {
+        let (stored, render, methods): (&[f64], &[f64], &[Method]) = match self {
             Self::Main => (&[1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0], &[], &[Method::Clift]),
             Self::Ablation => {
                 (&[1.0 / 32.0, 1.0 / 16.0, 0.125, 0.25, 0.5], &[], &[Method::Random, Method::Kmeans, Method::Clift])
@@ -40,10 +40,10 @@ impl Experiment {
             Self::Budget => (&[0.5], &[0.75, 0.5, 0.25, 0.125], &[Method::Clift]),
         };
         let shares = |shares: &[f64]| shares.iter().map(|&share| TokenCount::Share(share)).collect();
-        (eval.storage, eval.render, eval.variants) = (shares(storage), shares(render), methods.into());
+        (eval.stored_tokens, eval.render, eval.methods) = (shares(stored), shares(render), methods.into());
         if self == Self::Main {
             // The size axis: plain numbers, and the codec at two losses.
-            eval.tokens = ["f16", "coded", "coded-0.1"].map(|name| name.parse().expect("a storage")).into();
+            eval.formats = ["f16", "coded", "coded-0.1"].map(|name| name.parse().expect("a format")).into();
         }
         if self == Self::Budget {
             // As in the published table: no momentum, no count per cell.
@@ -70,9 +70,9 @@ mod tests {
             let mut eval = EvalConfig::default();
             experiment.apply(&mut eval);
             let of = |counts: &[TokenCount], total| counts.iter().map(|c| c.of(total).unwrap()).collect::<Vec<_>>();
-            let storage = of(&eval.storage, num_tokens);
-            let render = of(&eval.render, storage[0]);
-            (storage, render)
+            let stored = of(&eval.stored_tokens, num_tokens);
+            let render = of(&eval.render, stored[0]);
+            (stored, render)
         };
         assert_eq!(counts(Experiment::Main, 4096).0, [256, 512, 1024, 2048, 3072, 4096]);
         assert_eq!(counts(Experiment::Ablation, 4096).0, [128, 256, 512, 1024, 2048]);

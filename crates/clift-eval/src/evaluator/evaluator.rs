@@ -11,7 +11,7 @@ use crate::config::method::Method;
 use crate::config::split::{EvalFrames, EvalSplit};
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
-use crate::evaluator::progress::{Progress, SharedScenes};
+use crate::evaluator::progress::{EvalProgress, SharedScenes};
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
@@ -95,12 +95,12 @@ impl Evaluator {
         external_methods: &[ExternalMethod],
         training: Vec<TrainingCurve>,
         folder: &Path,
-        progress: &mut dyn Progress,
+        progress: &mut dyn EvalProgress,
     ) -> Result<Summary, EvalError> {
         let lpips = self.lpips(progress)?;
         let methods = self.methods(models)?;
         let sweep = Sweep {
-            tokens: self.storages(models, progress)?,
+            formats: self.formats(models, progress)?,
             methods,
             lpips: lpips.clone().ok(),
             external_methods: external_methods.to_vec(),
@@ -162,7 +162,7 @@ impl Evaluator {
         sweep: &Sweep,
         limits: SceneLimits,
         keep_figures: &mut dyn FnMut(&str, SceneFigures) -> Result<(), EvalError>,
-        progress: &mut dyn Progress,
+        progress: &mut dyn EvalProgress,
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
@@ -219,24 +219,24 @@ impl Evaluator {
         Ok((measured, skip_report))
     }
 
-    /// Returns the storages of tokens, without coded ones if the model has no codec.
-    fn storages(&self, models: &EvalModels, progress: &mut dyn Progress) -> Result<Vec<TokenCoding>, EvalError> {
-        let mut tokens = self.eval.tokens.clone();
-        let is_coded = |tokens: &TokenCoding| matches!(tokens, TokenCoding::Coded(_));
-        if let Some(coded) = tokens.iter().copied().find(is_coded).filter(|_| models.codec.is_none()) {
+    /// Returns the formats of the stored tokens, without coded ones if the model has no codec.
+    fn formats(&self, models: &EvalModels, progress: &mut dyn EvalProgress) -> Result<Vec<TokenCoding>, EvalError> {
+        let mut formats = self.eval.formats.clone();
+        let is_coded = |format: &TokenCoding| matches!(format, TokenCoding::Coded(_));
+        if let Some(coded) = formats.iter().copied().find(is_coded).filter(|_| models.codec.is_none()) {
             let fix = "the model has no token codec: fit it with `clift codec RUN`";
-            tokens.retain(|tokens| !is_coded(tokens));
-            if tokens.is_empty() {
+            formats.retain(|format| !is_coded(format));
+            if formats.is_empty() {
                 let (value, fix) = (coded.to_string(), fix.into());
-                return Err(ModelError::BadConfig { key: "eval.tokens", value, fix }.into());
+                return Err(ModelError::BadConfig { key: "eval.formats", value, fix }.into());
             }
             progress.note(&format!("{coded} tokens are left out: {fix}"));
         }
-        Ok(tokens)
+        Ok(formats)
     }
 
     /// Loads LPIPS, or returns the reason why LPIPS is not measured.
-    fn lpips(&self, progress: &mut dyn Progress) -> Result<Result<Lpips, String>, EvalError> {
+    fn lpips(&self, progress: &mut dyn EvalProgress) -> Result<Result<Lpips, String>, EvalError> {
         let size = self.reader.options.width.min(self.reader.options.height);
         Ok(match self.eval.lpips_path() {
             _ if size < LPIPS_MIN_SIZE_PX => {
@@ -266,7 +266,7 @@ impl Evaluator {
 
     /// Returns the methods of the config, or all methods with weights. Models of LVSM beside the run are always measured.
     fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
-        let requested = &self.eval.variants;
+        let requested = &self.eval.methods;
         if requested.is_empty() {
             return Ok(models.methods());
         }
@@ -287,7 +287,7 @@ impl Evaluator {
             _ => "baselines are always measured; remove the method",
         };
         let (value, fix) = (method.name().into(), fix.into());
-        Err(ModelError::BadConfig { key: "eval.variants", value, fix }.into())
+        Err(ModelError::BadConfig { key: "eval.methods", value, fix }.into())
     }
 }
 
@@ -309,14 +309,15 @@ fn check_counts(eval: &EvalConfig, fewest_tokens: usize, has_latents: bool) -> R
         let fix = "the latents of lvsm-ed belong to no view, so that none can be selected by the camera: write []";
         return bad("eval.render", count.to_string(), fix.into());
     }
-    let counts = eval.storage.iter().map(|count| ("eval.storage", count));
-    for (key, count) in counts.chain([("eval.validation_storage", &eval.validation_storage)]) {
+    let counts = eval.stored_tokens.iter().map(|count| ("eval.stored_tokens", count));
+    for (key, count) in counts.chain([("eval.validation_stored_tokens", &eval.validation_stored_tokens)]) {
         if count.of(fewest_tokens).is_err() {
             let fix = format!("write at most {fewest_tokens}, the fewest tokens of an evaluated scene");
             return bad(key, count.to_string(), fix);
         }
     }
-    let most_stored = eval.storage.iter().filter_map(|count| count.of(fewest_tokens).ok()).max().unwrap_or_default();
+    let most_stored =
+        eval.stored_tokens.iter().filter_map(|count| count.of(fewest_tokens).ok()).max().unwrap_or_default();
     for count in &eval.render {
         if !count.of(most_stored).is_ok_and(|rendered| rendered < most_stored) {
             let fix = format!("write less than {most_stored}, the most tokens that every scene stores");

@@ -7,7 +7,7 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 
 /// Receiver of progress, with the request to stop, and exchange with the other processes of an evaluation.
-pub trait Progress {
+pub trait EvalProgress {
     /// Reports that `scenes` of `total` are done. The first call has 0 scenes.
     fn done(&mut self, scenes: usize, total: usize);
 

@@ -98,7 +98,7 @@ fn add_jobs<'a>(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    for &count in &sweep.storage {
+    for &count in &sweep.stored_tokens {
         let num_storage_tokens = count.of(num_tokens)?;
         let clusters = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
         let own_norm: Vec<_> = normed
@@ -159,12 +159,12 @@ fn add_lvsm_jobs<'a>(
     let TargetRenderer { clip, sweep, .. } = *renderer;
     for model in &models.lvsm {
         let latents = model.network.encode(context);
-        for (i, storage) in sweep.formats(Method::LvsmEd).into_iter().enumerate() {
-            let TokenCoding::Plain(format) = storage else { continue };
+        for (i, coding) in sweep.formats(Method::LvsmEd).into_iter().enumerate() {
+            let TokenCoding::Plain(format) = coding else { continue };
             let stored = CompressedTokens::latents(model, latents.clone(), format, clip.context.num_views())?;
             let count = latents.dims()[1];
             let (num_storage_tokens, num_render_tokens) = (count, count);
-            let key = EvalKey { method: Method::LvsmEd, num_storage_tokens, num_render_tokens, tokens: Some(storage) };
+            let key = EvalKey { method: Method::LvsmEd, num_storage_tokens, num_render_tokens, tokens: Some(coding) };
             let job = RenderJob::new(key, &stored, None, if i == 0 { kept_views } else { &[] });
             renderer.warm_up(&job, metrics)?;
             jobs.push(job);

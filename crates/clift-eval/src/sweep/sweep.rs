@@ -11,7 +11,7 @@ use crate::sweep::predictions::ExternalMethod;
 #[derive(Clone, Debug)]
 pub struct Sweep {
     /// Token counts of the stored scene.
-    pub storage: Vec<TokenCount>,
+    pub stored_tokens: Vec<TokenCount>,
     /// Token counts of a rendered view, beside all stored tokens: numbers, or shares of the stored tokens. Counts that are
     /// not below the stored count are ignored.
     pub render: Vec<TokenCount>,
@@ -19,7 +19,7 @@ pub struct Sweep {
     pub selection: Selection,
     /// Number formats of the stored tokens, as in a scene file, each measured. Random subsets stay f32. Images are kept of
     /// the first format.
-    pub tokens: Vec<TokenCoding>,
+    pub formats: Vec<TokenCoding>,
     /// Rendered methods: all of [`EvalModels::methods`](crate::sweep::eval_models::EvalModels::methods), or fewer.
     pub methods: Vec<Method>,
     /// Path of the model in scene files, for the size of a coded file.
@@ -48,13 +48,13 @@ impl Sweep {
         counts.repeat(num_formats)
     }
 
-    /// Returns the storages of a method: random tokens have no file, and the codec is that of condensed tokens.
+    /// Returns the formats of a method: random tokens have no file, and the codec is that of condensed tokens.
     pub(crate) fn formats(&self, method: Method) -> Vec<TokenCoding> {
         let is_plain = |tokens: &TokenCoding| matches!(tokens, TokenCoding::Plain(_));
         let formats: Vec<TokenCoding> = match method {
-            Method::Clift => self.tokens.clone(),
+            Method::Clift => self.formats.clone(),
             Method::Random => Vec::new(),
-            _ => self.tokens.iter().copied().filter(is_plain).collect(),
+            _ => self.formats.iter().copied().filter(is_plain).collect(),
         };
         if formats.is_empty() { vec![TokenCoding::F32] } else { formats }
     }

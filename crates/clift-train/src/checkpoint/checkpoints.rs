@@ -10,7 +10,7 @@ use burn::store::ModuleRecord;
 use clift_data::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, first_not_f32};
 
-use crate::checkpoint::progress::{Best, Fingerprint, Progress, STATE, State, VERSION};
+use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};
 use crate::config::config::CheckpointConfig;
 use crate::error::TrainError;
 use crate::step::train_state::TrainState;
@@ -44,7 +44,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`TrainError::Io`]; older checkpoints are then unchanged, and files of this one are removed.
-    pub fn save(&self, train_state: &TrainState, progress: &Progress) -> Result<PathBuf, TrainError> {
+    pub fn save(&self, train_state: &TrainState, progress: &TrainingPosition) -> Result<PathBuf, TrainError> {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
         remove_if_present(&temporary)?;
@@ -61,7 +61,7 @@ impl Checkpoints {
     fn write(
         &self,
         train_state: &TrainState,
-        progress: &Progress,
+        progress: &TrainingPosition,
         temporary: &Path,
         path: &Path,
     ) -> Result<(), TrainError> {
@@ -91,7 +91,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then unchanged.
-    pub fn update(&self, progress: &Progress) -> Result<(), TrainError> {
+    pub fn update(&self, progress: &TrainingPosition) -> Result<(), TrainError> {
         let path = self.path_of(progress.step);
         State { progress: progress.clone(), ..State::read(&path)? }.write(&path)?;
         self.prune(progress)
@@ -101,7 +101,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// As [`load`](Self::load).
-    pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
+    pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<TrainingPosition>, TrainError> {
         let Some(step) = self.newest_step()? else { return Ok(None) };
         // Each save removes unfinished saves, but a finished stage makes no further save.
         self.remove_unfinished()?;
@@ -114,7 +114,7 @@ impl Checkpoints {
     /// [`TrainError::Damaged`] for a file that is missing or has another length or checksum, [`TrainError::BadConfig`] for a
     /// checkpoint of another network, [`TrainError::BadFile`] for contents that cannot be used, [`TrainError::Io`] for files
     /// that cannot be read, and if Burn panics.
-    pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<Progress, TrainError> {
+    pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<TrainingPosition, TrainError> {
         let path = self.path_of(step);
         let state = verify(&path).map_err(|source| {
             let is_damage = match &source {
@@ -178,7 +178,7 @@ impl Checkpoints {
         Ok(())
     }
 
-    fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
+    fn prune(&self, progress: &TrainingPosition) -> Result<(), TrainError> {
         self.remove_unfinished()?;
         for step in steps_to_remove(&self.steps()?, &self.retention, progress.best) {
             let path = self.path_of(step);
@@ -240,7 +240,7 @@ fn apply(
     folder: &Path,
     expected: Option<&ModelConfig>,
     train_state: &mut TrainState,
-) -> Result<Progress, TrainError> {
+) -> Result<TrainingPosition, TrainError> {
     let bad = |name: &str, reason: String| bad(folder, name, reason);
     let State { progress, model, loss_scale, .. } = state;
     if let (Some(model), Some(expected)) = (&model, expected)
@@ -297,7 +297,8 @@ mod tests {
         let model = clift_model::Clift::new(&config, 0, &device);
         let train_state = TrainState::new(model, &crate::config::config::OptimizerConfig::default(), device);
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
-        let step = checkpoints.save(&train_state, &Progress { step: 1, ..Progress::default() }).unwrap();
+        let step =
+            checkpoints.save(&train_state, &TrainingPosition { step: 1, ..TrainingPosition::default() }).unwrap();
         (train_state, checkpoints, step)
     }
 

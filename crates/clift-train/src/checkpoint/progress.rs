@@ -23,7 +23,7 @@ pub(crate) const VERSION: u32 = 3;
 #[serde(deny_unknown_fields)]
 pub(crate) struct State {
     pub version: u32,
-    pub progress: Progress,
+    pub progress: TrainingPosition,
     /// Checksums of the other files, by name.
     pub files: BTreeMap<String, Fingerprint>,
     /// Config of the network; `None` for checkpoints that were opened without one.
@@ -44,7 +44,7 @@ pub(crate) struct Fingerprint {
 /// and random streams are functions of the seed and the step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Progress {
+pub struct TrainingPosition {
     /// Updates made, including the skipped ones.
     pub step: u64,
     /// Consecutive updates that were skipped just before.
@@ -121,7 +121,8 @@ mod tests {
         for &value in values {
             recent.push(value, -value);
         }
-        let progress = Progress { step: 7, best: Some(Best { step: 5, psnr }), recent, ..Progress::default() };
+        let progress =
+            TrainingPosition { step: 7, best: Some(Best { step: 5, psnr }), recent, ..TrainingPosition::default() };
         State { version: VERSION, progress, files: BTreeMap::new(), model: None, loss_scale: None }
     }
 

@@ -1,10 +1,10 @@
 //! Checks of a config beyond its types: ranges, and values that depend on each other.
 
-use clift_data::{DataConfig, DataError, SourceKind, Split};
+use clift_data::{BadConfig, DataConfig, SourceKind, Split, check_config};
 use clift_eval::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 
-use crate::config::config::{Config, MAX_TOKENS, OptimizerConfig};
+use crate::config::config::{CheckpointConfig, Config, MAX_TOKENS, OptimizerConfig};
 use crate::error::{TrainError, bad};
 use crate::events::Stage;
 
@@ -14,24 +14,23 @@ impl Config {
     /// # Errors
     /// [`TrainError::BadConfig`] with key, value and fix.
     pub fn validate(&self) -> Result<(), TrainError> {
-        if self.run_dir.as_os_str().is_empty() {
-            return Err(bad("run_dir", "\"\"", "write the directory of the run"));
-        }
+        let has_run_dir = !self.run_dir.as_os_str().is_empty();
+        check_config(has_run_dir, "run_dir", "\"\"", || "write the directory of the run".into())?;
         self.model.validate()?;
-        self.data.views.validate().map_err(in_section("data.views"))?;
+        self.data.views.validate().map_err(|error| error.in_section("data.views"))?;
         self.validate_size()?;
         self.validate_token_counts()?;
         validate_data(&self.data)?;
         self.validate_loss()?;
-        if self.data.hold_out == 1 {
-            return Err(bad("data.hold_out", 1, "no frame would be left to train on: write 2 or more, or 0 for none"));
-        }
+        check_config(self.data.hold_out != 1, "data.hold_out", 1, || {
+            "no frame would be left to train on: write 2 or more, or 0 for none".into()
+        })?;
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
         for settings in [Stage::Stage1, Stage::Stage2].map(|stage| self.stage(stage)) {
             let name = settings.stage.name();
             in_range(&format!("{name}.batch_size"), settings.batch_size, 1, usize::MAX)?;
             in_range(&format!("{name}.accumulate"), settings.accumulate, 1, settings.batch_size)?;
-            settings.optimizer.validate(name)?;
+            settings.optimizer.validate().map_err(|error| error.in_section(&format!("{name}.optimizer")))?;
         }
         for (key, value, least, most) in [
             ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
@@ -43,51 +42,44 @@ impl Config {
         ] {
             in_range(key, value, least, most)?;
         }
-        if checkpoint.keep_every > 0
-            && (checkpoint.every == 0 || !checkpoint.keep_every.is_multiple_of(checkpoint.every))
-        {
-            let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
-            return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
-        }
-        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
-            if counts.is_empty() {
-                return Err(bad(key, "[]", "write at least one count"));
-            }
-        }
-        if !(0.0..=1.0).contains(&stage1.half_resolution) {
-            return Err(bad("stage1.half_resolution", stage1.half_resolution, "write 0 to 1"));
+        let CheckpointConfig { every, keep_every, .. } = *checkpoint;
+        let is_saved = keep_every == 0 || (every > 0 && keep_every.is_multiple_of(every));
+        check_config(is_saved, "checkpoint.keep_every", keep_every, || {
+            format!("write 0 or a multiple of checkpoint.every, which is {every}")
+        })?;
+        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.stored_tokens", &eval.stored_tokens)] {
+            check_config(!counts.is_empty(), key, "[]", || "write at least one count".into())?;
         }
         let [low, high] = stage1.keep_tokens;
-        if !(low > 0.0 && low <= high && high <= 1.0) {
-            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
-        }
-        if self.model.has_latents() && low < 1.0 {
-            let fix = "the decoder of model.architecture = \"lvsm-ed\" reads all latents: write [1.0, 1.0]";
-            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), fix));
-        }
-        if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
-            return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
-        }
-        if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
-            return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
-        }
-        let interpolation = stage2.weight_interpolation;
-        if !(interpolation > 0.0 && interpolation <= 1.0) {
-            return Err(bad("stage2.weight_interpolation", interpolation, "write a number above 0, at most 1"));
+        let keep_tokens = |is_valid: bool, fix: &str| {
+            check_config(is_valid, "stage1.keep_tokens", format!("[{low}, {high}]"), || fix.into())
+        };
+        keep_tokens(low > 0.0 && low <= high && high <= 1.0, "write 0 < smallest <= largest <= 1")?;
+        let all_latents = "the decoder of model.architecture = \"lvsm-ed\" reads all latents: write [1.0, 1.0]";
+        keep_tokens(!self.model.has_latents() || low == 1.0, all_latents)?;
+        let (half, share) = (stage1.half_resolution, 0.0..=1.0);
+        let (tolerance, factor, weight) =
+            (clusters.kmeans.tolerance, stage2.renderer_lr_factor, stage2.weight_interpolation);
+        for (key, value, is_valid, fix) in [
+            ("stage1.half_resolution", half, share.contains(&half), "write 0 to 1"),
+            ("clusters.kmeans.tolerance", tolerance, (0.0..1.0).contains(&tolerance), "write 0 or a small fraction"),
+            ("stage2.renderer_lr_factor", factor, share.contains(&factor), "write 0 to 1"),
+            ("stage2.weight_interpolation", weight, weight > 0.0 && weight <= 1.0, "write a number above 0, at most 1"),
+        ] {
+            check_config(is_valid, key, value, || fix.into())?;
         }
         Ok(())
     }
 
-    fn validate_size(&self) -> Result<(), TrainError> {
+    fn validate_size(&self) -> Result<(), BadConfig> {
         let patch_size = self.model.patch_size;
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
-            if value == 0 || !value.is_multiple_of(patch_size) {
+            check_config(value > 0 && value.is_multiple_of(patch_size), key, value, || {
                 let below = value / patch_size * patch_size;
                 let near =
                     if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
-                let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
-                return Err(bad(key, value, &fix));
-            }
+                format!("write a multiple of model.patch_size = {patch_size}, such as {near}")
+            })?;
         }
         Ok(())
     }
@@ -118,19 +110,16 @@ impl Config {
     }
 
     /// Checks weights and sizes of the loss. The VGG weights are checked when training starts.
-    fn validate_loss(&self) -> Result<(), TrainError> {
+    fn validate_loss(&self) -> Result<(), BadConfig> {
         let weight = self.loss.perceptual_weight;
-        if !(weight >= 0.0 && weight.is_finite()) {
-            return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
-        }
+        check_config(weight >= 0.0 && weight.is_finite(), "loss.perceptual_weight", weight, || {
+            "write 0 or a positive number".into()
+        })?;
         let (width, height) = (self.data.width, self.data.height);
-        if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
-            let fix = format!(
-                "VGG-19 needs images of at least {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, not {width} x {height}: write 0"
-            );
-            return Err(bad("loss.perceptual_weight", weight, &fix));
-        }
-        Ok(())
+        let (is_large, least) = (width.min(height) >= PERCEPTUAL_MIN_SIZE_PX, PERCEPTUAL_MIN_SIZE_PX);
+        check_config(weight == 0.0 || is_large, "loss.perceptual_weight", weight, || {
+            format!("VGG-19 needs images of at least {least} x {least}, not {width} x {height}: write 0")
+        })
     }
 
     fn validate_token_counts(&self) -> Result<(), TrainError> {
@@ -147,7 +136,7 @@ impl Config {
         }
         if self.clusters.grouping == Grouping::Tile {
             let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
-            for (key, count) in grid.chain([("eval.validation_storage", &self.eval.validation_storage)]) {
+            for (key, count) in grid.chain([("eval.validation_stored_tokens", &self.eval.validation_stored_tokens)]) {
                 let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
                 if too_few(views.min_context) || too_few(views.max_context) {
                     return Err(bad(key, count, "write at least one tile for every context view"));
@@ -158,79 +147,59 @@ impl Config {
     }
 }
 
-fn validate_data(data: &DataConfig) -> Result<(), TrainError> {
+fn validate_data(data: &DataConfig) -> Result<(), BadConfig> {
     in_range("data.num_threads", data.num_threads, 0, 1024)?;
     in_range("data.num_prefetch", data.num_prefetch, 1, 1024)?;
     if data.source == SourceKind::Synthetic {
         if let Some(root) = data.root.as_ref().filter(|root| !root.as_os_str().is_empty()) {
             let fix = "synthetic scenes are read from no folder: write data.source = \"auto\", or remove the key";
-            return Err(bad("data.root", root.display(), fix));
+            return Err(BadConfig::new("data.root", root.display(), fix));
         }
         return validate_synthetic(data);
     }
-    if data.root.is_none() {
-        return Err(bad("data.root", "missing", "write the folder of the data set or capture"));
-    }
-    data.image_cache.validate().map_err(in_section("data.image_cache"))?;
-    data.filters.validate().map_err(in_section("data.filters"))
+    check_config(data.root.is_some(), "data.root", "missing", || "write the folder of the data set or capture".into())?;
+    data.image_cache.validate().map_err(|error| error.in_section("data.image_cache"))?;
+    data.filters.validate().map_err(|error| error.in_section("data.filters"))
 }
 
-fn validate_synthetic(data: &DataConfig) -> Result<(), TrainError> {
+fn validate_synthetic(data: &DataConfig) -> Result<(), BadConfig> {
     let synthetic = &data.synthetic;
-    synthetic.validate().map_err(in_section("data.synthetic"))?;
+    synthetic.validate().map_err(|error| error.in_section("data.synthetic"))?;
     if synthetic.width < data.width || synthetic.height < data.height {
         let fix = format!(
             "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
             synthetic.width, synthetic.height, data.width, data.height
         );
-        return Err(bad("data.width, data.height", format!("{}, {}", data.width, data.height), &fix));
+        return Err(BadConfig::new("data.width, data.height", format!("{}, {}", data.width, data.height), fix));
     }
-    if synthetic.split != Split::default() {
-        let fix = "remove the key: a run trains on one split and evaluates on the other";
-        return Err(bad("data.synthetic.split", synthetic.split, fix));
-    }
-    Ok(())
+    check_config(synthetic.split == Split::default(), "data.synthetic.split", synthetic.split, || {
+        "remove the key: a run trains on one split and evaluates on the other".into()
+    })
 }
 
 impl OptimizerConfig {
-    fn validate(&self, stage: &str) -> Result<(), TrainError> {
+    fn validate(&self) -> Result<(), BadConfig> {
+        let Self { betas, weight_decay, spike_factor, .. } = *self;
         for (key, value) in [("learning_rate", self.learning_rate), ("max_grad_norm", self.max_grad_norm)] {
-            if !(value > 0.0 && value.is_finite()) {
-                return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
-            }
+            check_config(value > 0.0 && value.is_finite(), key, value, || "write a positive number".into())?;
         }
-        if !self.betas.iter().all(|beta| (0.0..1.0).contains(beta)) {
-            let value = format!("{:?}", self.betas);
-            return Err(bad(&format!("{stage}.optimizer.betas"), value, "write two numbers of at least 0, below 1"));
-        }
-        if !(self.weight_decay >= 0.0 && self.weight_decay.is_finite()) {
-            let key = format!("{stage}.optimizer.weight_decay");
-            return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));
-        }
-        if !(self.spike_factor == 0.0 || (self.spike_factor > 1.0 && self.spike_factor.is_finite())) {
-            let key = format!("{stage}.optimizer.spike_factor");
-            return Err(bad(&key, self.spike_factor, "write 0 to disable spike detection, or a number above 1"));
-        }
-        in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
+        check_config(betas.iter().all(|beta| (0.0..1.0).contains(beta)), "betas", format!("{betas:?}"), || {
+            "write two numbers of at least 0, below 1".into()
+        })?;
+        check_config(weight_decay >= 0.0 && weight_decay.is_finite(), "weight_decay", weight_decay, || {
+            "write 0 or a positive number".into()
+        })?;
+        let is_factor = spike_factor == 0.0 || (spike_factor > 1.0 && spike_factor.is_finite());
+        check_config(is_factor, "spike_factor", spike_factor, || {
+            "write 0 to disable spike detection, or a number above 1".into()
+        })?;
+        in_range("max_bad_steps", self.max_bad_steps as usize, 1, usize::MAX)
     }
 }
 
-fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), TrainError> {
-    if (least..=most).contains(&value) {
-        return Ok(());
-    }
-    let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
-    Err(bad(key, value, &fix))
-}
-
-/// Adds the section to the key of an error; for `map_err`.
-fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
-    move |error| match error {
-        // The problem has the form "is VALUE; FIX".
-        DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
-            Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
-            None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),
-        },
-        other => other.into(),
-    }
+fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), BadConfig> {
+    check_config((least..=most).contains(&value), key, value, || match most {
+        usize::MAX => format!("write at least {least}"),
+        _ => format!("write {least} to {most}"),
+    })
 }

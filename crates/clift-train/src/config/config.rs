@@ -76,19 +76,19 @@ impl Config {
     }
 
     /// Returns the token counts of stored scenes in an evaluation: those of `eval`, or all latents.
-    pub fn eval_storage(&self) -> Vec<TokenCount> {
-        if self.model.has_latents() { vec![TokenCount::Share(1.0)] } else { self.eval.storage.clone() }
+    pub fn eval_stored_tokens(&self) -> Vec<TokenCount> {
+        if self.model.has_latents() { vec![TokenCount::Share(1.0)] } else { self.eval.stored_tokens.clone() }
     }
 
     /// Returns the settings of an evaluation, without LPIPS and external methods.
-    pub(crate) fn sweep(&self, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
+    pub(crate) fn sweep(&self, stored_tokens: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
         let Self { seed, eval, clusters, model, device, .. } = self;
         Sweep {
             min_timed_views: 0,
-            storage,
+            stored_tokens,
             render: eval.render.clone(),
             selection: eval.selection,
-            tokens: eval.tokens.clone(),
+            formats: eval.formats.clone(),
             methods,
             model_path: self.run_dir.display().to_string(),
             kmeans: clusters.kmeans.clone(),
@@ -330,51 +330,78 @@ impl Default for CheckpointConfig {
 mod tests {
     use super::*;
 
-    #[test]
-    fn invalid_values_are_named_with_the_fix() {
+    type Change = fn(&mut Config);
+
+    /// Returns a valid config with a change.
+    fn changed(change: Change) -> Config {
         let mut config = Config { run_dir: "run".into(), ..Config::default() };
         (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
         config.validate().expect("the default is valid");
-        config.loss.perceptual_weight = -0.5;
-        let message = config.validate().unwrap_err().to_string();
-        assert_eq!(message, "`loss.perceptual_weight` = -0.5: write 0 or a positive number");
-        config.loss.perceptual_weight = 0.5;
-        config.validate().expect("evaluation needs no weights of the loss");
-        let message = config.loss.weights().unwrap_err().to_string();
-        assert!(
-            message.starts_with("`loss.vgg_weights` = missing") && message.contains(PERCEPTUAL_COMMAND),
-            "{message}"
-        );
-        config.loss.vgg_weights = Some("no/such/file".into());
-        let message = config.loss.weights().unwrap_err().to_string();
-        assert!(message.contains("file not found") && message.contains(PERCEPTUAL_COMMAND), "{message}");
-        (config.data.width, config.data.height) = (8, 256);
-        assert!(config.validate().unwrap_err().to_string().contains("16 x 16"), "too small for the network");
-        (config.data.width, config.data.height) = (256, 256);
-        config.stage1.half_resolution = 0.5;
-        config.validate_half_resolution().expect("128 x 128");
-        config.data.width = 16;
-        let message = config.validate_half_resolution().unwrap_err().to_string();
-        assert!(message.ends_with("32 or more as data.width, not 16: VGG-19 needs 16 pixels"), "{message}");
-        config.loss.perceptual_weight = 0.0;
-        config.validate_half_resolution().expect("without the loss");
-        config.data.height = 248;
-        let message = config.validate_half_resolution().unwrap_err().to_string();
-        let fix = "write 0, or a multiple of 2 x model.patch_size = 16 as data.height, not 248";
-        assert_eq!(message, format!("`stage1.half_resolution` = 0.5: {fix}"));
-        config.validate().expect("whole images have whole patches");
-        config.data.height = 256;
-        (config.data.width, config.stage1.half_resolution) = (256, 600.0);
-        assert_eq!(config.validate().unwrap_err().to_string(), "`stage1.half_resolution` = 600: write 0 to 1");
-        config.stage1.half_resolution = 0.0;
-        assert_eq!(config.loss.weights().expect("no term"), None);
-        config.data.views.min_context = 0;
-        assert!(config.validate().is_err(), "and no panic");
-        config.data.views.min_context = 4;
-        config.stage1.optimizer.weight_decay = f64::NAN;
-        assert!(config.validate().unwrap_err().to_string().starts_with("`stage1.optimizer.weight_decay` = NaN"));
-        config.stage1.optimizer.betas = [0.9, 1.0];
-        let message = config.validate().unwrap_err().to_string();
-        assert!(message.starts_with("`stage1.optimizer.betas` = [0.9, 1.0]: write two numbers"), "{message}");
+        change(&mut config);
+        config
+    }
+
+    #[test]
+    fn invalid_values_are_named_with_the_fix() {
+        let cases: [(Change, &str); 6] = [
+            (|c| c.loss.perceptual_weight = -0.5, "`loss.perceptual_weight` = -0.5: write 0 or a positive number"),
+            (
+                |c| (c.loss.perceptual_weight, c.data.width) = (0.5, 8),
+                "`loss.perceptual_weight` = 0.5: VGG-19 needs images of at least 16 x 16, not 8 x 256: write 0",
+            ),
+            (|c| c.stage1.half_resolution = 600.0, "`stage1.half_resolution` = 600: write 0 to 1"),
+            (|c| c.data.views.min_context = 0, "`data.views.min_context` = 0: use 2 or more"),
+            (
+                |c| c.stage1.optimizer.weight_decay = f64::NAN,
+                "`stage1.optimizer.weight_decay` = NaN: write 0 or a positive number",
+            ),
+            (
+                |c| c.stage2.optimizer.betas = [0.9, 1.0],
+                "`stage2.optimizer.betas` = [0.9, 1.0]: write two numbers of at least 0, below 1",
+            ),
+        ];
+        for (change, expected) in cases {
+            assert_eq!(changed(change).validate().unwrap_err().to_string(), expected);
+        }
+    }
+
+    #[test]
+    fn half_resolution_needs_whole_patches_and_the_size_of_the_loss() {
+        let check = |change: Change| {
+            let mut config = changed(change);
+            config.stage1.half_resolution = 0.5;
+            config.validate().expect("whole images are valid");
+            config.validate_half_resolution().map_err(|error| error.to_string())
+        };
+        assert_eq!(check(|_| ()), Ok(()));
+        assert_eq!(check(|c| c.data.width = 16), Ok(()));
+        let cases: [(Change, &str); 2] = [
+            (|c| c.data.height = 248, "a multiple of 2 x model.patch_size = 16 as data.height, not 248"),
+            (
+                |c| (c.loss.perceptual_weight, c.data.width) = (0.5, 16),
+                "32 or more as data.width, not 16: VGG-19 needs 16 pixels",
+            ),
+        ];
+        for (change, fix) in cases {
+            assert_eq!(check(change), Err(format!("`stage1.half_resolution` = 0.5: write 0, or {fix}")));
+        }
+    }
+
+    #[test]
+    fn missing_weights_of_the_loss_are_refused_when_read() {
+        assert_eq!(changed(|_| ()).loss.weights().expect("no term"), None);
+        let cases: [(Change, &str); 2] = [
+            (|c| c.loss.perceptual_weight = 0.5, "`loss.vgg_weights` = missing: the perceptual term needs"),
+            (
+                |c| (c.loss.perceptual_weight, c.loss.vgg_weights) = (0.5, Some("no/file".into())),
+                "`loss.vgg_weights` = no/file: file not found",
+            ),
+        ];
+        for (change, expected) in cases {
+            let config = changed(change);
+            config.validate().expect("evaluation needs no weights of the loss");
+            let message = config.loss.weights().unwrap_err().to_string();
+            assert!(message.starts_with(expected) && message.contains(PERCEPTUAL_COMMAND), "{message}");
+        }
     }
 }

@@ -6,14 +6,12 @@
 //! - `errors`: unknown keys, wrong values, ranges
 //! - `config`: every key of an experiment
 //! - `checks`: values that must fit each other
-//! - `former_names`: keys and values that were renamed
 //! - `parse`: read a config file
 
 pub(crate) mod checks;
 pub(crate) mod config;
 pub(crate) mod diagnostic;
 pub(crate) mod errors;
-pub(crate) mod former_names;
 pub(crate) mod overrides;
 pub(crate) mod parse;
 pub(crate) mod schema;

@@ -9,7 +9,7 @@ use toml::de::{DeTable, DeValue};
 
 use crate::config::diagnostic::SourceText;
 
-/// Change of a key by `--set`, or of a former name in the file.
+/// Change of a key by `--set`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Override {
     /// Dotted key.
@@ -18,22 +18,11 @@ pub struct Override {
     pub from: Option<String>,
     /// New value as TOML.
     pub to: String,
-    /// Whether `key` is a former name, and `to` the present name.
-    pub is_renamed: bool,
-}
-
-impl Override {
-    pub(crate) fn renamed(key: String, to: String) -> Self {
-        Self { key, from: None, to, is_renamed: true }
-    }
 }
 
 impl fmt::Display for Override {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { key, from, to, is_renamed } = self;
-        if *is_renamed {
-            return write!(f, "`{key}` is named `{to}` now");
-        }
+        let Self { key, from, to } = self;
         write!(f, "--set {key}: {} -> {to}", from.as_deref().unwrap_or("(default)"))
     }
 }

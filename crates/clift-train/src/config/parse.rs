@@ -9,9 +9,8 @@ use toml::de::DeTable;
 
 use crate::config::diagnostic::SourceText;
 use crate::config::errors;
-use crate::config::former_names::apply_former_names;
 use crate::config::overrides::{Override, dotted, merge_value, parse_override, to_toml};
-use crate::config::schema::Keys;
+use crate::config::schema::sections;
 use crate::error::TrainError;
 
 /// Errors of a configuration.
@@ -82,17 +81,15 @@ fn parse_checked<T: DeserializeOwned + Serialize>(
 ) -> Result<(T, Vec<Override>), ConfigError> {
     let sources = SourceText::new(path, file, overrides);
     let padded = sources.padded_overrides();
-    let keys = Keys::of::<T>();
-    let (mut root, mut changed) = merged(&sources, file, &padded)?;
-    changed.extend(apply_former_names(root.get_mut(), &keys));
-    let unknown = errors::unknown_keys(&keys, root.get_ref(), &sources);
+    let (root, changed) = merged(&sources, file, &padded)?;
+    let unknown = errors::unknown_keys(&sections::<T>(), root.get_ref(), &sources);
     if !unknown.is_empty() {
         let all: Vec<_> = unknown.iter().map(|diagnostic| sources.render(diagnostic)).collect();
         return Err(ConfigError::Invalid(all.join("\n\n")));
     }
     let invalid = |diagnostic| ConfigError::Invalid(sources.render(&diagnostic));
-    let config = T::deserialize(toml::Deserializer::from(root.clone()))
-        .map_err(|error| invalid(errors::wrong_value(&error, root.get_ref(), &sources)))?;
+    let config: T = serde_path_to_error::deserialize(toml::Deserializer::from(root.clone()))
+        .map_err(|error| invalid(errors::wrong_value(&error, &sources)))?;
     if let Some(diagnostic) = errors::too_long(&config, root.get_ref(), &sources) {
         return Err(invalid(diagnostic));
     }
@@ -125,7 +122,7 @@ fn merged<'t>(
         let key = dotted(&key);
         match changed.iter_mut().find(|change| change.key == key) {
             Some(change) => change.to = to,
-            None => changed.push(Override { key, from: from.as_ref().map(to_toml), to, is_renamed: false }),
+            None => changed.push(Override { key, from: from.as_ref().map(to_toml), to }),
         }
     }
     changed.retain(|change| change.from.as_ref() != Some(&change.to));
@@ -135,8 +132,6 @@ fn merged<'t>(
 // The suite compares whole messages with `tests/snapshots`.
 #[cfg(test)]
 mod tests {
-    use clift_model::Grouping;
-
     use super::*;
     use crate::config::config::Config;
 
@@ -200,28 +195,5 @@ mod tests {
             let message = message(FILE, &["device=wgpu", text]);
             assert!(message.starts_with("wrong value of `stage1.keep_tokens`\n  --> --set:1:20\n"), "{message}");
         }
-    }
-
-    #[test]
-    fn former_names_are_read_with_a_note() {
-        let file = format!("recompute = true\n{FILE}grouping = \"patch\"\n");
-        for (file, overrides) in [(file.as_str(), &[][..]), (FILE, &["recompute=true", "clusters.grouping=patch"][..])]
-        {
-            let (config, changed) = parse(file, overrides).unwrap();
-            assert!(config.activation_checkpointing && config.clusters.grouping == Grouping::Tile);
-            assert_eq!(
-                changed[overrides.len()..],
-                [
-                    "`recompute` is named `activation_checkpointing` now",
-                    "`clusters.grouping = \"patch\"` is named `clusters.grouping = \"tile\"` now"
-                ]
-            );
-            let written = toml::to_string(&config).unwrap();
-            assert!(written.contains("activation_checkpointing = true\n") && !written.contains("recompute"));
-            assert!(written.contains("grouping = \"tile\"\n") && !written.contains("\"patch\""));
-        }
-        let message = message(FILE, &["recompute=true", "activation_checkpointing=false"]);
-        assert!(message.starts_with("unknown key `recompute`"), "{message}");
-        assert!(message.contains("`activation_checkpointing`"), "{message}");
     }
 }

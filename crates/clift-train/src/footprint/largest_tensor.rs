@@ -111,9 +111,12 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         Stage::Stage1 => Vec::new(),
         Stage::Stage2 | Stage::Clusters => cluster_counts(config, scene.num_tokens)?,
         // An evaluation index may have other numbers of contexts.
-        Stage::Eval => {
-            eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<_, _>>().unwrap_or_default()
-        }
+        Stage::Eval => eval
+            .stored_tokens
+            .iter()
+            .map(|count| count.of(scene.num_tokens))
+            .collect::<Result<_, _>>()
+            .unwrap_or_default(),
     };
     let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
     if config.model.has_latents() {

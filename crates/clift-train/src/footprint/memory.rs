@@ -115,7 +115,7 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let eval = &config.eval;
     let parameters = Parameters::of(&config.model);
     let all = num_tokens(config, eval.num_context)?;
-    let stored = config.eval_storage().iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
+    let stored = config.eval_stored_tokens().iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let has_latents = config.model.has_latents();
     // LVSM encodes its latents beside the patches, and has no second stage.
     let encoded = if has_latents { all + num_patches(config, eval.num_context)? } else { all };

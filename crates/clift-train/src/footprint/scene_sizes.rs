@@ -48,16 +48,16 @@ pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainE
 /// Returns the settings of an evaluation: the methods of the config, or those for which a run has weights.
 pub fn eval_sizes(config: &Config) -> Sweep {
     if config.model.has_latents() {
-        return config.sweep(config.eval_storage(), vec![Method::LvsmEd]);
+        return config.sweep(config.eval_stored_tokens(), vec![Method::LvsmEd]);
     }
     let condensed = Method::condensed(config.clusters.grouping);
-    let mut methods = config.eval.variants.clone();
+    let mut methods = config.eval.methods.clone();
     // The condenser of another grouping belongs to another run.
     methods.retain(|method| !method.is_condensed() || *method == condensed);
     if methods.is_empty() {
         methods = vec![Method::Random, Method::Kmeans, condensed];
     }
-    config.sweep(config.eval.storage.clone(), methods)
+    config.sweep(config.eval.stored_tokens.clone(), methods)
 }
 
 /// Whether an evaluation measures LPIPS.

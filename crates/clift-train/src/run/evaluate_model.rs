@@ -44,13 +44,13 @@ pub fn evaluate_model(
     if last.has_condenser && stage1.is_none() {
         // Its renderer was trained on condensed tokens: other tokens would be no fair baseline.
         let own = Method::condensed(config.clusters.grouping);
-        let methods = &mut config.eval.variants;
+        let methods = &mut config.eval.methods;
         if methods.is_empty() {
             methods.push(own);
         }
         if let Some(method) = methods.iter().find(|method| **method != own) {
             let fix = "give the stage-1 model, which renders this method, with --stage1";
-            return Err(bad("eval.variants", method.name(), fix));
+            return Err(bad("eval.methods", method.name(), fix));
         }
     }
     if last.has_condenser {

@@ -9,7 +9,7 @@ use clift_eval::{peak_bytes, psnr_of_mse};
 use clift_model::{Clift, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
-use crate::checkpoint::progress::{Best, Progress};
+use crate::checkpoint::progress::{Best, TrainingPosition};
 use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
@@ -92,7 +92,7 @@ impl StagePlan<'_> {
 pub(crate) struct TrainLoop<'a> {
     plan: &'a StagePlan<'a>,
     checkpoints: Checkpoints,
-    progress: Progress,
+    progress: TrainingPosition,
     /// Step of the newest checkpoint; 0 for none.
     saved: u64,
     validation: &'a Validation<'a>,
@@ -110,7 +110,7 @@ impl<'a> TrainLoop<'a> {
     pub fn new(
         plan: &'a StagePlan,
         checkpoints: Checkpoints,
-        progress: Progress,
+        progress: TrainingPosition,
         validation: &'a Validation,
         stop: &'a AtomicBool,
         log: RunLog<'a>,
@@ -263,7 +263,7 @@ impl<'a> TrainLoop<'a> {
         };
         self.log.bad_step(&line);
         let keys = line.scenes.iter().map(|scene| scene.key.as_str()).collect::<Vec<_>>().join(", ");
-        let Progress { step, bad_steps: count, .. } = self.progress;
+        let TrainingPosition { step, bad_steps: count, .. } = self.progress;
         if count < self.plan.settings.optimizer.max_bad_steps {
             self.log.event(&Event::Warning(format!("skipped step {step}: {anomaly} (scenes {keys})")));
             return Ok(());
@@ -305,7 +305,7 @@ impl<'a> TrainLoop<'a> {
 
     /// Validates the step if it is due and was not validated before.
     fn validate_if_due(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
-        let Progress { step, bad_steps, validated, .. } = self.progress;
+        let TrainingPosition { step, bad_steps, validated, .. } = self.progress;
         let is_due = self.is_last() || (is_multiple(step, self.plan.config.eval.every) && bad_steps == 0);
         if !is_due || validated == step {
             return Ok(());

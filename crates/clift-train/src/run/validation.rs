@@ -59,7 +59,7 @@ impl<'a> Validation<'a> {
             device: config.device.to_string(),
             command: std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect::<Vec<_>>().join(" "),
         };
-        let sweep = config.sweep(eval.storage.clone(), Vec::new());
+        let sweep = config.sweep(eval.stored_tokens.clone(), Vec::new());
         let evaluator = Evaluator::new(eval, sweep, description, reader, frames, device)?;
         if !evaluator.skip_report.skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report)));
@@ -102,17 +102,17 @@ impl<'a> Validation<'a> {
         let is_stage2 = stage == Stage::Stage2;
         let model = TrainedModel::snapshot(model, sizes, is_stage2);
         let mut models = EvalModels::new(model.clone());
-        let (storage, method) = if is_stage2 {
+        let (stored_tokens, method) = if is_stage2 {
             models.set_stage2(clusters.grouping, model);
-            (eval.validation_storage, Method::condensed(clusters.grouping))
+            (eval.validation_stored_tokens, Method::condensed(clusters.grouping))
         } else {
             (TokenCount::Share(1.0), if sizes.has_latents() { Method::LvsmEd } else { Method::Kmeans })
         };
         let all = &self.evaluator.sweep;
         let sweep = Sweep {
-            storage: vec![storage],
+            stored_tokens: vec![stored_tokens],
             render: Vec::new(),
-            tokens: vec![TokenCoding::F32],
+            formats: vec![TokenCoding::F32],
             methods: vec![method],
             ..all.clone()
         };

@@ -45,7 +45,7 @@ pub struct RunScenes {
     /// Settings of the encoding; the context frames and the number of stored tokens are replaced.
     pub options: EncodeOptions,
     /// Offered numbers of stored tokens.
-    pub storage: Vec<TokenCount>,
+    pub stored_tokens: Vec<TokenCount>,
     /// Words after `clift encode` that name the run and its settings.
     pub encode_args: Vec<String>,
     /// Further words of `clift render` for a scene of the run, such as its device.
@@ -119,7 +119,7 @@ impl RunScenes {
         let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
         let options = EncodeOptions {
             context: Some(views.context.clone()),
-            storage: TokenCount::Count(stored),
+            stored_tokens: TokenCount::Count(stored),
             ..self.options.clone()
         };
         let EncodedScene { mut scene, clusters, .. } = encode(&self.model, &self.reader, *index, &options)?;
@@ -133,9 +133,9 @@ impl RunScenes {
             &scene.key,
             "--context",
             &frames,
-            "--storage",
+            "--stored-tokens",
             &stored,
-            "--tokens",
+            "--format",
             RUN_FORMAT.name(),
             "-o",
             &file,
@@ -158,7 +158,7 @@ impl RunScenes {
 
     /// Returns the offered counts of a scene, ascending; all tokens are always offered.
     fn storage_counts(&self, num_patches: usize) -> Vec<usize> {
-        let mut counts: Vec<usize> = self.storage.iter().filter_map(|count| count.of(num_patches).ok()).collect();
+        let mut counts: Vec<usize> = self.stored_tokens.iter().filter_map(|count| count.of(num_patches).ok()).collect();
         counts.push(num_patches);
         counts.sort_unstable();
         counts.dedup();

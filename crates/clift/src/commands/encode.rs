@@ -53,19 +53,19 @@ pub struct EncodeArgs {
     pub context: Vec<String>,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
     #[arg(long, value_name = "COUNT")]
-    pub storage: Option<TokenCount>,
-    /// Storage: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]
+    pub stored_tokens: Option<TokenCount>,
+    /// Format of the tokens: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]
     ///
     /// `coded` needs the token codec of the model, which training fits (`clift codec` for other models). Its step is the
     /// one that lost 0.02 dB on training scenes, or DB with `coded-DB`.
     #[arg(long, value_name = "FORMAT", conflicts_with_all = ["quality", "size_kb"])]
-    pub tokens: Option<TokenCoding>,
+    pub format: Option<TokenCoding>,
     /// Code the tokens with at most this loss of PSNR in dB, measured on this scene
     #[arg(long, value_name = "DB", value_parser = parse_loss, conflicts_with = "size_kb")]
     pub quality: Option<f64>,
     /// Code the tokens into a file of at most N kB
     ///
-    /// Without --storage, the number of tokens is the one with the best expected PSNR at this size.
+    /// Without --stored-tokens, the number of tokens is the one with the best expected PSNR at this size.
     #[arg(long, value_name = "N", value_parser = parse_kb)]
     pub size_kb: Option<f64>,
     /// Also write the cluster of every token, as JSON
@@ -128,7 +128,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then_some(context),
         num_context: model_args.num_context(reader.source.as_ref(), scene)?,
-        storage: TokenCount::Share(if config.model.has_latents() { 1.0 } else { 0.25 }),
+        stored_tokens: TokenCount::Share(if config.model.has_latents() { 1.0 } else { 0.25 }),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
@@ -136,8 +136,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     };
     let model = model_args.open()?;
     let coding = Coding::new(args, &path.weights, &model)?;
-    let storage = coding.storage(args, &options, &reader);
-    let mut encoded = encode(&model, &reader, scene, &EncodeOptions { storage, ..options })?;
+    let stored_tokens = coding.stored_tokens(args, &options, &reader);
+    let mut encoded = encode(&model, &reader, scene, &EncodeOptions { stored_tokens, ..options })?;
     let written = coding.write(&mut encoded, args, (&model, &reader, scene))?;
     if let Some(file) = clusters {
         file.write_json(&ClustersFile::of(&encoded))?;
@@ -242,13 +242,13 @@ enum Coding {
 
 impl Coding {
     fn new(args: &EncodeArgs, weights: &Path, model: &TrainedModel) -> anyhow::Result<Self> {
-        let is_coded = matches!(args.tokens, Some(TokenCoding::Coded(_)));
+        let is_coded = matches!(args.format, Some(TokenCoding::Coded(_)));
         if model.config.has_latents() && (is_coded || args.quality.is_some() || args.size_kb.is_some()) {
-            usage_bail!("the latents of lvsm-ed have no codec; store them with --tokens f32, f16 or int8");
+            usage_bail!("the latents of lvsm-ed have no codec; store them with --format f32, f16 or int8");
         }
         let found = || TokenCodec::beside(weights, model);
         let codec = || found()?.ok_or_else(|| ModelError::NoCodec { path: TokenCodec::path_of(weights) });
-        Ok(match (args.quality, args.size_kb, args.tokens) {
+        Ok(match (args.quality, args.size_kb, args.format) {
             (Some(loss), ..) => Self::Measured(codec()?, loss),
             (_, Some(kb), _) => Self::Bytes(codec()?, (kb * 1e3) as u64),
             (.., Some(TokenCoding::Plain(format))) => Self::Plain(format),
@@ -261,14 +261,14 @@ impl Coding {
     }
 
     /// Returns the number of stored tokens: with a size, the number of the best expected PSNR.
-    fn storage(&self, args: &EncodeArgs, options: &EncodeOptions, reader: &ClipReader) -> TokenCount {
-        let Self::Bytes(codec, bytes) = self else { return args.storage.unwrap_or(options.storage) };
+    fn stored_tokens(&self, args: &EncodeArgs, options: &EncodeOptions, reader: &ClipReader) -> TokenCount {
+        let Self::Bytes(codec, bytes) = self else { return args.stored_tokens.unwrap_or(options.stored_tokens) };
         let views = options.context.as_ref().map_or(options.num_context, Vec::len);
         let (height, width) = (reader.options.height, reader.options.width);
         let num_patches = codec.model.num_patches(views, height, width).unwrap_or(1);
         let tokens = *bytes as f64 - coded_overhead(views, options.model_path.len()) as f64;
         let best = TokenCount::Share(codec.rates.share_for_bytes(num_patches, tokens.max(1.0)));
-        args.storage.unwrap_or(best)
+        args.stored_tokens.unwrap_or(best)
     }
 
     /// Writes the scene, whose tokens become those of the file.

@@ -71,15 +71,15 @@ fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     if let Some(experiment) = args.preset {
         experiment.apply(&mut config.eval);
     }
-    if !args.storage.is_empty() {
-        config.eval.storage.clone_from(&args.storage);
+    if !args.stored_tokens.is_empty() {
+        config.eval.stored_tokens.clone_from(&args.stored_tokens);
     }
     if !args.render.is_empty() {
         config.eval.render.clone_from(&args.render);
     }
     config.eval.selection = args.selection.unwrap_or(config.eval.selection);
-    if !args.tokens.is_empty() {
-        config.eval.tokens.clone_from(&args.tokens);
+    if !args.formats.is_empty() {
+        config.eval.formats.clone_from(&args.formats);
     }
     if args.index.is_some() {
         config.eval.index.clone_from(&args.index);
@@ -126,7 +126,7 @@ pub struct EvalArgs {
     pub stage1: Option<PathBuf>,
     /// Run an experiment of the paper: main, ablation, patchwise or budget
     ///
-    /// Sets the methods, --storage, --render and --selection; options of the command line take precedence. main: quality
+    /// Sets the methods, --stored-tokens, --render and --selection; options of the command line take precedence. main: quality
     /// against data size. ablation: random tokens, K-means, K-means with condenser. patchwise: tiles of the views against
     /// K-means, with and without condenser; needs --with. budget: half of the tokens stored, decreasing rendered counts.
     #[arg(long, value_name = "NAME")]
@@ -139,16 +139,16 @@ pub struct EvalArgs {
     pub with: Vec<PathBuf>,
     /// Stored token counts, as numbers or shares, e.g. 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
-    pub storage: Vec<TokenCount>,
+    pub stored_tokens: Vec<TokenCount>,
     /// Also render from fewer tokens: numbers or shares of the stored, e.g. 128,1/2
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
     /// Select rendered tokens by this rule: paper, global, scaled or random
     #[arg(long, value_name = "PRESET")]
     pub selection: Option<Selection>,
-    /// Storage of the tokens: f32, f16, int8, coded, or coded-DB, e.g. f16,coded-0.1
-    #[arg(long, value_delimiter = ',', value_name = "FORMAT")]
-    pub tokens: Vec<TokenCoding>,
+    /// Formats of the tokens: f32, f16, int8, coded, or coded-DB, e.g. f16,coded-0.1
+    #[arg(long = "format", value_delimiter = ',', value_name = "FORMAT")]
+    pub formats: Vec<TokenCoding>,
     /// Also score the target images of an external method; repeatable
     #[arg(long, value_name = "DIR")]
     pub predictions: Vec<PathBuf>,

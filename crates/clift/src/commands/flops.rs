@@ -60,7 +60,7 @@ fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
         return Ok(Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts });
     };
     let (config, _) = read_config(path, &args.set, check_plan)?;
-    let counts = given(config.eval_storage().into_iter().rev().collect());
+    let counts = given(config.eval_stored_tokens().into_iter().rev().collect());
     let Config { model, data, eval, .. } = config;
     Ok(Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts })
 }

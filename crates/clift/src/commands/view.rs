@@ -121,7 +121,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let options = EncodeOptions {
         context: None,
         num_context: config.eval.num_context,
-        storage: config.eval.validation_storage,
+        stored_tokens: config.eval.validation_stored_tokens,
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
@@ -137,7 +137,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
         reader,
         items,
         options,
-        storage: config.eval.storage,
+        stored_tokens: config.eval.stored_tokens,
         encode_args,
         render_args: device_args(args.overrides.device),
     };

@@ -22,7 +22,7 @@ fn linear_warm_up_truncates_and_ends_at_last() {
 fn number_of_contexts_outside_the_bounds_is_refused() {
     for num_context in [0, 1, 3, 7] {
         let error = sampler().sample_frames(200, &[], 0, num_context, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
-        assert_eq!(error.to_string(), format!("num_context is {num_context}; use 4 to 6"));
+        assert_eq!(error.to_string(), format!("`num_context` = {num_context}: use 4 to 6"));
     }
 }
 
@@ -46,16 +46,16 @@ fn samples_are_reproducible() {
 fn invalid_value_is_named_with_its_key() {
     assert!(sampler().validate().is_ok());
     for (invalid, expected) in [
-        (ViewSampler { min_context: 1, ..sampler() }, "min_context is 1; use 2 or more"),
-        (ViewSampler { max_context: 3, ..sampler() }, "max_context is 3"),
-        (ViewSampler { max_context: 10_001, ..sampler() }, "max_context is 10001; use 10000 or fewer"),
-        (ViewSampler { num_targets: 0, ..sampler() }, "num_targets is 0"),
-        (ViewSampler { num_targets: usize::MAX, ..sampler() }, "num_targets is 18446744073709551615; use 10000 or"),
-        (ViewSampler { num_targets: 27, with_replacement: false, ..sampler() }, "num_targets is 27"),
-        (ViewSampler { min_gap: [30, 25], ..sampler() }, "min_gap is [30, 25]"),
-        (ViewSampler { min_gap: [4, 45], ..sampler() }, "min_gap is [4, 45]; 6 distinct contexts need a gap of 5"),
-        (ViewSampler { max_gap: [45, 40], ..sampler() }, "max_gap is [45, 40]"),
-        (ViewSampler { max_gap: [20, 135], ..sampler() }, "max_gap is [20, 135]"),
+        (ViewSampler { min_context: 1, ..sampler() }, "`min_context` = 1: use 2 or more"),
+        (ViewSampler { max_context: 3, ..sampler() }, "`max_context` = 3"),
+        (ViewSampler { max_context: 10_001, ..sampler() }, "`max_context` = 10001: use 10000 or fewer"),
+        (ViewSampler { num_targets: 0, ..sampler() }, "`num_targets` = 0"),
+        (ViewSampler { num_targets: usize::MAX, ..sampler() }, "`num_targets` = 18446744073709551615: use 10000 or"),
+        (ViewSampler { num_targets: 27, with_replacement: false, ..sampler() }, "`num_targets` = 27"),
+        (ViewSampler { min_gap: [30, 25], ..sampler() }, "`min_gap` = [30, 25]"),
+        (ViewSampler { min_gap: [4, 45], ..sampler() }, "`min_gap` = [4, 45]: 6 distinct contexts need a gap of 5"),
+        (ViewSampler { max_gap: [45, 40], ..sampler() }, "`max_gap` = [45, 40]"),
+        (ViewSampler { max_gap: [20, 135], ..sampler() }, "`max_gap` = [20, 135]"),
     ] {
         let message = invalid.validate().unwrap_err().to_string();
         assert!(message.starts_with(expected), "{message}");

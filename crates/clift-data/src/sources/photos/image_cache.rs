@@ -9,7 +9,8 @@ use std::time::UNIX_EPOCH;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::error::{DataError, check_config};
+use crate::bad_config::{BadConfig, check_config};
+use crate::error::DataError;
 use crate::files::atomic::TEMPORARY;
 use crate::files::caches::cache_folder;
 use crate::files::listing::has_ending;
@@ -47,10 +48,10 @@ impl ImageCacheConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] with the invalid field.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// The invalid field.
+    pub fn validate(&self) -> Result<(), BadConfig> {
         let is_valid = self.max_gb.is_finite() && self.max_gb >= 0.0;
-        check_config(is_valid, "max_gb", || format!("is {}; use 0 or more gigabytes", self.max_gb))
+        check_config(is_valid, "max_gb", self.max_gb, || "use 0 or more gigabytes".into())
     }
 
     /// Returns the configured folder, or the default one if the environment has a folder for caches.
@@ -275,7 +276,7 @@ mod tests {
         let disabled = ImageCacheConfig { max_gb: 0.0, ..ImageCacheConfig::default() };
         assert!(ImageCache::open(&disabled, [32, 32]).is_none());
         let error = ImageCacheConfig { max_gb: -1.0, ..disabled }.validate().unwrap_err();
-        assert_eq!(error.to_string(), "max_gb is -1; use 0 or more gigabytes");
+        assert_eq!(error.to_string(), "`max_gb` = -1: use 0 or more gigabytes");
     }
 
     /// Figures of docs/results/performance.md.

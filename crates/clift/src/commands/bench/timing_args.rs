@@ -20,7 +20,7 @@ pub struct TimingArgs {
     pub warmup: usize,
     /// Set the stored tokens, as a number or a share
     #[arg(long, value_name = "COUNT", default_value = "1/4")]
-    pub storage: TokenCount,
+    pub stored_tokens: TokenCount,
     /// Set the tokens a view is rendered from, as a number or a share [default: all]
     #[arg(long, value_name = "COUNT")]
     pub render: Option<TokenCount>,
@@ -37,7 +37,7 @@ impl TimingArgs {
             repeats: self.repeats,
             warmup: self.warmup,
             error: false,
-            storage: self.storage,
+            stored_tokens: self.stored_tokens,
             render: self.render,
             features: None,
         }

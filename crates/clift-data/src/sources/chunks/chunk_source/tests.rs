@@ -182,7 +182,7 @@ fn invalid_fields_of_view_are_refused() {
     for limit in [f64::NAN, f64::INFINITY, 0.0, -1.0] {
         let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(limit) };
         let message = filters.validate().unwrap_err().to_string();
-        assert_eq!(message, format!("max_fov_deg is {limit}; use a positive number such as 100"));
+        assert_eq!(message, format!("`max_fov_deg` = {limit}: use a positive number such as 100"));
         assert!(ChunkSource::open(&fixture("re10k-mini"), Split::Train, &filters).is_err());
     }
     assert!(ALL.validate().is_ok());
