@@ -180,7 +180,7 @@ fn evaluation(config: &Config) -> Result<PartPlan, TrainError> {
     let scene = scene_with_all_tokens(config, eval.num_context, eval.num_targets)?;
     let sweep = eval_sizes(config);
     let mut macs = part_macs(&config.model, Part::Encoder, &scene);
-    for count in config.eval_storage() {
+    for count in config.eval_stored_tokens() {
         let count = count.of(scene.num_tokens)?;
         let scene = scene_with_stored_tokens(scene, count);
         macs += part_macs(&config.model, Part::Condenser, &scene);
