@@ -8,7 +8,7 @@ use clift_data::SourceKind;
 use clift_eval::available_bytes;
 use clift_model::{DeviceName, FlopConvention, ModelConfig, Parameters, Part, SceneSizes};
 use clift_train::{
-    BatchParts, Config, Stage, StageSettings, TrainError, cluster_counts, eval_sizes, num_tokens, peak_bytes,
+    BatchParts, Config, RunStep, Stage, StageSettings, TrainError, cluster_counts, eval_sizes, num_tokens, peak_bytes,
     possible_sizes, scene_with_all_tokens, scene_with_stored_tokens, typical_sizes,
 };
 use serde::Serialize;
@@ -90,12 +90,12 @@ pub fn plan(config: &Config, options: &PlanOptions) -> Result<Plan, TrainError> 
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
     let share = |part: PartPlan| PartPlan { count: part.count.map(|count| count.div_ceil(num_ranks as u64)), ..part };
-    let part = |part| match part {
-        Stage::Stage1 | Stage::Stage2 => update(config, part, &parameters, options),
-        Stage::Clusters => clusters(config, is_timed).map(share),
-        Stage::Eval => evaluation(config, is_timed).map(share),
+    let part = |&run_step: &RunStep| match run_step {
+        RunStep::Train(stage) => update(config, stage, &parameters, options),
+        RunStep::Clusters => clusters(config, is_timed).map(share),
+        RunStep::Eval => evaluation(config, is_timed).map(share),
     };
-    let parts = config.parts().into_iter().map(part).collect::<Result<Vec<_>, _>>()?;
+    let parts = config.run_steps().iter().map(part).collect::<Result<Vec<_>, _>>()?;
     let mut plan = Plan {
         num_ranks,
         device: config.device,
@@ -215,7 +215,7 @@ fn update(
     }
     let mut of_rank = config.clone();
     of_rank.set_accumulate(stage, parts.num_parts());
-    let mut part = untimed(&of_rank, stage, macs)?;
+    let mut part = untimed(&of_rank, stage.into(), macs)?;
     if num_ranks > 1 {
         part.peak_bytes += sum_bytes(trained_parameters, num_ranks);
         // A part of every round is sent to the ranks that add it up, and once the sum to the others.
@@ -275,7 +275,7 @@ fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
         (count, _) => Some(count),
     };
     let count = num_scenes.map(|count| (count * config.clusters.num_passes) as u64);
-    Ok(PartPlan { count, compute_s, ..untimed(config, Stage::Clusters, macs)? })
+    Ok(PartPlan { count, compute_s, ..untimed(config, RunStep::Clusters, macs)? })
 }
 
 fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
@@ -312,18 +312,18 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
         None
     };
     let count = (eval.num_scenes > 0).then_some(eval.num_scenes as u64);
-    Ok(PartPlan { count, compute_s, ..untimed(config, Stage::Eval, encoder + rest)? })
+    Ok(PartPlan { count, compute_s, ..untimed(config, RunStep::Eval, encoder + rest)? })
 }
 
-/// Returns the counted values of a part that trains no parameters.
-fn untimed(config: &Config, part: Stage, macs: f64) -> Result<PartPlan, TrainError> {
+/// Returns the counted values of a step that trains no parameters.
+fn untimed(config: &Config, run_step: RunStep, macs: f64) -> Result<PartPlan, TrainError> {
     Ok(PartPlan {
-        part: part.name(),
+        part: run_step.name(),
         unit: "scene",
         count: None,
         trained_parameters: 0,
         gmacs: macs / 1e9,
-        peak_bytes: peak_bytes(config, part)?,
+        peak_bytes: peak_bytes(config, run_step)?,
         sent_bytes: 0,
         compute_s: None,
         busy_threads: None,

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::config::config::Config;
 use crate::config::parse::parse_config;
 use crate::error::{TrainError, bad};
-use crate::events::{Event, Sink, Stage};
+use crate::events::{Event, RunStep, Sink, Stage};
 use crate::run::extend::{ExtensionRecord, StepExtension};
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::training_data::TrainingData;
@@ -71,8 +71,8 @@ impl RunFile {
 /// Options of a run beside its config.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RunOptions {
-    /// Run only this stage.
-    pub only: Option<Stage>,
+    /// Run only this step.
+    pub only: Option<RunStep>,
     /// Train and evaluate on this number of training scenes.
     pub overfit: Option<usize>,
     /// Start a new run; the existing run directory is renamed.
@@ -81,8 +81,8 @@ pub struct RunOptions {
     pub extend: bool,
 }
 
-/// Parts of a run with a folder.
-const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
+/// Steps of training, each of which has a folder.
+const TRAINING_STEPS: [RunStep; 3] = [RunStep::Train(Stage::Stage1), RunStep::Clusters, RunStep::Train(Stage::Stage2)];
 
 /// Locks the run directory of a config, new or existing, and writes the resolved config to it. Returns the lock, and the
 /// `data.hold_out` of the run.
@@ -95,7 +95,7 @@ pub(crate) fn open_folder(
     sink: &mut dyn Sink,
 ) -> Result<(RunLock, usize), TrainError> {
     let folder = &config.run_dir;
-    if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
+    if options.fresh && !matches!(options.only, None | Some(RunStep::Train(Stage::Stage1))) {
         return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
     }
     if options.fresh && folder.exists() {
@@ -109,7 +109,7 @@ pub(crate) fn open_folder(
     let lock = RunLock::take(folder, LockedFolder::Run, sink)?;
     remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
     // A run that failed before its first stage may get other settings.
-    let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
+    let has_begun = TRAINING_STEPS.iter().any(|step| folder.join(step.name()).exists());
     let mut file = RunFile::new(options.overfit);
     let written = folder.join("config.toml");
     if has_begun && !written.exists() {
