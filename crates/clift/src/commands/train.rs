@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 use clift_eval::available_bytes;
-use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, Stage, StageSettings, memory_warning};
+use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning};
 
-use crate::commands::args::parse::{parse_count, parse_stage};
+use crate::commands::args::parse::{parse_count, parse_training_step};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::ranks::{connect, finish};
 use crate::interrupt;
@@ -46,8 +46,8 @@ pub struct TrainArgs {
     #[command(flatten)]
     pub overrides: ConfigArgs,
     /// Run one stage: stage1, clusters or stage2
-    #[arg(long, value_name = "STAGE", value_parser = parse_stage)]
-    pub only: Option<Stage>,
+    #[arg(long, value_name = "STAGE", value_parser = parse_training_step)]
+    pub only: Option<RunStep>,
     /// Train and evaluate on the first K training scenes
     #[arg(long, value_name = "K", value_parser = parse_count)]
     pub overfit: Option<usize>,
