@@ -228,9 +228,9 @@ pub fn inference_rates(
             kmeans.push((count, timed.seconds / seeds.len() as f64));
         }
     } else {
-        let has_latents = config.model.has_latents();
-        let last = TrainedModel::snapshot(&model, &shallow.model, !has_latents);
-        let models = EvalModels { stage2: (!has_latents).then(|| last.clone()), ..EvalModels::new(last) };
+        let supports_clusters = config.model.architecture.supports_clusters();
+        let last = TrainedModel::snapshot(&model, &shallow.model, supports_clusters);
+        let models = EvalModels { stage2: supports_clusters.then(|| last.clone()), ..EvalModels::new(last) };
         let lpips = config.eval.lpips_path().filter(|path| measures_lpips(config) && path.is_file());
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };

@@ -61,9 +61,10 @@ impl Config {
         if !(low > 0.0 && low <= high && high <= 1.0) {
             return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
         }
-        if self.model.has_latents() && low < 1.0 {
-            let fix = "the decoder of model.architecture = \"lvsm-ed\" reads all latents: write [1.0, 1.0]";
-            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), fix));
+        let architecture = self.model.architecture;
+        if !architecture.supports_clusters() && low < 1.0 {
+            let fix = format!("model.architecture = \"{architecture}\" renders from all tokens: write [1.0, 1.0]");
+            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), &fix));
         }
         if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
             return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));

@@ -58,9 +58,13 @@ pub struct Config {
 }
 
 impl Config {
-    /// Returns the stages of a run in their order: a network without condenser has one.
+    /// Returns the stages of a run in their order: a network without clusters has one.
     pub fn stages(&self) -> &'static [Stage] {
-        if self.model.has_latents() { &[Stage::Stage1] } else { &[Stage::Stage1, Stage::Clusters, Stage::Stage2] }
+        if self.model.architecture.supports_clusters() {
+            &[Stage::Stage1, Stage::Clusters, Stage::Stage2]
+        } else {
+            &[Stage::Stage1]
+        }
     }
 
     /// Returns the step of stage 1 whose gaps between contexts stage 2 has: the last one, or the last of the warm-up of the
@@ -75,9 +79,14 @@ impl Config {
         [self.stages(), &[Stage::Eval]].concat()
     }
 
-    /// Returns the token counts of stored scenes in an evaluation: those of `eval`, or all latents.
+    /// Returns the token counts of stored scenes in an evaluation: those of `eval`, or all tokens of a
+    /// network without clusters.
     pub fn eval_storage(&self) -> Vec<TokenCount> {
-        if self.model.has_latents() { vec![TokenCount::Share(1.0)] } else { self.eval.storage.clone() }
+        if self.model.architecture.supports_clusters() {
+            self.eval.storage.clone()
+        } else {
+            vec![TokenCount::Share(1.0)]
+        }
     }
 
     /// Returns the settings of an evaluation, without LPIPS and external methods.

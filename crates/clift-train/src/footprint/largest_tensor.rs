@@ -106,8 +106,9 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
     let num_scenes = config.stage(part).micro_batch_size();
     let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
     let mut all = of(Part::Encoder, &scene);
+    let supports_clusters = config.model.architecture.supports_clusters();
     let counts = match part {
-        _ if config.model.has_latents() => Vec::new(),
+        _ if !supports_clusters => Vec::new(),
         Stage::Stage1 => Vec::new(),
         Stage::Stage2 | Stage::Clusters => cluster_counts(config, scene.num_tokens)?,
         // An evaluation index may have other numbers of contexts.
@@ -116,12 +117,12 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         }
     };
     let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
-    if config.model.has_latents() {
+    if !supports_clusters {
         all.extend(of(Part::Renderer, &scene));
     } else if part == Stage::Eval || part == Stage::Clusters && config.clusters.grouping == Grouping::Kmeans {
         all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
     }
-    if matches!(part, Stage::Stage2 | Stage::Eval) && !config.model.has_latents() {
+    if matches!(part, Stage::Stage2 | Stage::Eval) && supports_clusters {
         all.extend(of(Part::Condenser, &scene_with_stored_tokens(scene, most)));
         all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }
