@@ -5,7 +5,7 @@ use burn::tensor::{Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
 use crate::network::config::ModelConfig;
-use crate::network::renderer::Renderer;
+use crate::network::parts::renderer::Renderer;
 
 /// Hashes paths, shapes and values of all parameters of a module; returns 64 hexadecimal digits. Equal weights have equal
 /// hashes on every device.

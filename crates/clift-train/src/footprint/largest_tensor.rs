@@ -112,8 +112,9 @@ fn tensors(config: &Config, run_step: RunStep) -> Result<Vec<(String, u64)>, Tra
     let num_scenes = stage.map_or(1, |stage| config.stage(stage).micro_batch_size());
     let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
     let mut all = of(Part::Encoder, &scene);
+    let supports_clusters = config.model.architecture.supports_clusters();
     let counts = match run_step {
-        _ if config.model.has_latents() => Vec::new(),
+        _ if !supports_clusters => Vec::new(),
         RunStep::Train(Stage::Stage1) => Vec::new(),
         RunStep::Train(Stage::Stage2) | RunStep::Clusters => cluster_counts(config, scene.num_tokens)?,
         // An evaluation index may have other numbers of contexts.
@@ -125,13 +126,13 @@ fn tensors(config: &Config, run_step: RunStep) -> Result<Vec<(String, u64)>, Tra
             .unwrap_or_default(),
     };
     let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
-    if config.model.has_latents() {
+    if !supports_clusters {
         all.extend(of(Part::Renderer, &scene));
     } else if run_step == RunStep::Eval || run_step == RunStep::Clusters && config.clusters.grouping == Grouping::Kmeans
     {
         all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
     }
-    if matches!(run_step, RunStep::Train(Stage::Stage2) | RunStep::Eval) && !config.model.has_latents() {
+    if matches!(run_step, RunStep::Train(Stage::Stage2) | RunStep::Eval) && supports_clusters {
         all.extend(of(Part::Condenser, &scene_with_stored_tokens(scene, most)));
         all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }

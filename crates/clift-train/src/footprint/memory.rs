@@ -8,6 +8,7 @@ use crate::error::TrainError;
 use crate::events::{RunStep, Stage};
 use crate::footprint::scene_sizes::{
     VIEWS_PER_PASS, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips, num_patches, num_tokens,
+    scene_with_all_tokens,
 };
 
 /// Memory of a process besides its tensors: code, threads and buffers (docs/guide/training.md).
@@ -101,6 +102,7 @@ fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
     Ok(InferenceSizes {
         num_parameters: parameters.total,
         num_loaded: parameters.encoder + parameters.renderer,
+        num_encoder_rows: most,
         num_tokens: most,
         num_clusters: cluster_counts(config, most)?.last().copied(),
         num_targets: 0,
@@ -116,19 +118,19 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let parameters = Parameters::of(&config.model);
     let all = num_tokens(config, eval.num_context)?;
     let stored = config.eval_stored_tokens().iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
-    let has_latents = config.model.has_latents();
-    // LVSM encodes its latents beside the patches, and has no second stage.
-    let encoded = if has_latents { all + num_patches(config, eval.num_context)? } else { all };
-    let second_renderer = if has_latents { 0 } else { parameters.renderer };
+    let supports_clusters = config.model.architecture.supports_clusters();
+    let second_renderer = if supports_clusters { parameters.renderer } else { 0 };
+    let scene = scene_with_all_tokens(config, eval.num_context, 0)?;
     let sweep = eval_sizes(config);
     let num_rendered: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {
-        // Each stage has a renderer.
+        // Each of two stages has a renderer.
         num_parameters: parameters.total + second_renderer,
         num_loaded: parameters.condenser + parameters.renderer,
-        num_tokens: encoded,
-        num_clusters: stored.iter().max().copied().filter(|_| !has_latents),
+        num_encoder_rows: scene.num_encoder_rows(&config.model),
+        num_tokens: all,
+        num_clusters: stored.iter().max().copied().filter(|_| supports_clusters),
         num_targets: eval.num_targets.min(VIEWS_PER_PASS),
         num_patches: num_patches(config, 1)?,
         // Images of every count and method are kept until the metrics of the scene are computed.

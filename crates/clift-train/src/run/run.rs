@@ -27,7 +27,7 @@ use crate::events::{Event, RunStep, Sink, Stage};
 use crate::fit_token_codec::ensure_codec;
 use crate::footprint::largest_tensor;
 use crate::run::eval_folder::{EvalFolder, SUMMARY, read_finished};
-use crate::run::evaluate_model::{open_lvsm, open_stage2};
+use crate::run::evaluate_model::{open_stage2, open_whole};
 use crate::run::init_from::{init_from, stage2_weights};
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
@@ -84,7 +84,9 @@ impl Run {
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
         if let Some(only) = options.only.filter(|only| !config.run_steps().contains(only)) {
-            let fix = "a network of model.architecture = \"lvsm-ed\" has one stage: write stage1, or leave --only out";
+            let architecture = config.model.architecture;
+            let fix =
+                format!("model.architecture = \"{architecture}\" has one stage: write stage1, or leave --only out");
             return Err(bad("--only", only.name(), fix));
         }
         largest_tensor::check_tensors(&config, &device, config.run_steps())?;
@@ -189,7 +191,8 @@ impl Run {
     }
 
     /// Evaluates the run. `beside` are other runs, evaluated on the same views: one with the same stage 1 whose stage 2 was
-    /// trained on other groups of tokens, and runs of LVSM with distinct numbers of latents.
+    /// trained on other groups of tokens, and runs of networks without clusters, with distinct numbers of
+    /// tokens.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] if stage 2 was trained on another
@@ -206,8 +209,8 @@ impl Run {
         let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::EvaluatedRun, sink)).transpose()?;
         let mut models = self.models(sink)?;
         for other in beside {
-            if other.model.has_latents() {
-                models.lvsm.push(open_lvsm(&self.config, other, &models.lvsm, &self.device)?);
+            if !other.model.architecture.supports_clusters() {
+                models.whole.push(open_whole(&self.config, other, &models.whole, &self.device)?);
                 continue;
             }
             if other.clusters.grouping == self.config.clusters.grouping {

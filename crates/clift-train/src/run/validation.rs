@@ -106,7 +106,9 @@ impl<'a> Validation<'a> {
             models.set_stage2(clusters.grouping, model);
             (eval.validation_stored_tokens, Method::condensed(clusters.grouping))
         } else {
-            (TokenCount::Share(1.0), if sizes.has_latents() { Method::LvsmEd } else { Method::Kmeans })
+            let architecture = sizes.architecture;
+            let method = if architecture.supports_clusters() { Method::Kmeans } else { Method::Whole(architecture) };
+            (TokenCount::Share(1.0), method)
         };
         let all = &self.evaluator.sweep;
         let sweep = Sweep {

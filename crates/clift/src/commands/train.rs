@@ -32,11 +32,11 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     let stop = interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();
-    let (run_dir, has_latents) = (config.run_dir.clone(), config.model.has_latents());
+    let (run_dir, supports_clusters) = (config.run_dir.clone(), config.model.architecture.supports_clusters());
     let run = Run::open_on(ranks.clone(), config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, !has_latents))
+    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, supports_clusters))
 }
 
 #[derive(Debug, clap::Args)]
