@@ -15,7 +15,7 @@ use crate::run::lock::{LockedFolder, RunLock, has_other_files};
 use crate::version::check_version;
 
 const FILE: &str = "run.json";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Keys that may change when a run is resumed.
 const FREE_KEYS: [&str; 9] = [
