@@ -7,7 +7,8 @@ use crate::support::{repository, sources};
 /// A crate, the crates that it may use, and its folders and root files: each imports only those that stand before it.
 type Crate = (&'static str, &'static str, &'static str);
 
-const CRATES: [Crate; 8] = [
+const CRATES: [Crate; 9] = [
+    ("clift-core", "", "error statistics random rgb_image files geometry"),
     (
         "clift-kernels",
         "",
@@ -15,34 +16,38 @@ const CRATES: [Crate; 8] = [
     ),
     (
         "clift-model",
-        "clift-kernels",
+        "clift-core clift-kernels",
         "error names atomic_files device ops views tokens network cost weights codec scene",
     ),
     (
         "clift-data",
-        "",
-        "error statistics random skip_report files geometry image torch scene_source synthetic sources sampling config \
+        "clift-core",
+        "error skip_report files geometry image torch scene_source synthetic sources sampling config \
          tools dataset",
     ),
     (
         "clift-eval",
-        "clift-kernels clift-model clift-data",
+        "clift-core clift-kernels clift-model clift-data",
         "error system config metrics upload statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",
-        "clift-kernels clift-model clift-data clift-eval",
+        "clift-core clift-kernels clift-model clift-data clift-eval",
         "error distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
     ),
     (
         "clift-bench",
-        "clift-kernels clift-model clift-data clift-eval clift-train",
+        "clift-core clift-kernels clift-model clift-data clift-eval clift-train",
         "allreduce cases data_reading runner precision doctor plan",
     ),
-    ("clift-view", "clift-kernels clift-model clift-data clift-eval", "error protocol scenes session server"),
+    (
+        "clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "error protocol scenes session server",
+    ),
     (
         "clift",
-        "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
         "output interrupt exit_code threads commands cli reference_pages",
     ),
 ];

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use burn::tensor::Tensor;
-use clift_data::median;
+use clift_core::median;
 use clift_eval::psnr_of_mse;
 use clift_model::{DeviceName, Precision};
 use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze};

@@ -9,10 +9,8 @@
 
 use std::sync::Arc;
 
-use clift_data::{
-    Camera, ClipOptions, ClipReader, DVec3, DataError, IntrinsicsNorm, Pose, PoseRotation, PoseScale, RgbImage,
-    SceneSource, ViewIndices,
-};
+use clift_core::{Camera, DVec3, IntrinsicsNorm, Pose, PoseRotation, PoseScale, RgbImage};
+use clift_data::{ClipOptions, ClipReader, DataError, SceneSource, ViewIndices};
 
 struct Wall;
 

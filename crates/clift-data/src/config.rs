@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::normalization::{PoseRotation, PoseScale};
+use clift_core::{PoseRotation, PoseScale};
+
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
 use crate::sampling::view_sampler::{ViewSampler, is_default};

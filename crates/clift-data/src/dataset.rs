@@ -120,11 +120,11 @@ pub fn half_resolution_clips(config: &DataConfig, reader: &ClipReader) -> Result
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::item_rng;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
     use crate::testing::rooms;
+    use clift_core::item_rng;
 
     #[test]
     fn small_synthetic_clips_show_what_reduced_ones_show() {

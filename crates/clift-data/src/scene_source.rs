@@ -3,9 +3,9 @@
 use serde::{Deserialize, Serialize};
 use strum::Display;
 
+use clift_core::{Camera, RgbImage};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 
 /// One of the two splits of a data set. Prints as `train` or `test`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display)]

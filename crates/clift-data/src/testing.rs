@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use clift_core::{Camera, RgbImage};
+
 use crate::error::DataError;
 use crate::files::listing::file_names;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::filters::SceneFilters;

@@ -1,6 +1,6 @@
 //! Conversions between camera conventions and back.
 
-use clift_data::{Camera, IntrinsicsNorm, Pose};
+use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 

@@ -11,9 +11,8 @@ use std::error::Error;
 use std::path::Path;
 
 use burn::tensor::{Tensor, TensorData};
-use clift_data::{
-    ClipOptions, ClipReader, DatasetRoot, PoseRotation, PoseScale, SourceOptions, Split, ViewIndices, open_source,
-};
+use clift_core::{PoseRotation, PoseScale};
+use clift_data::{ClipOptions, ClipReader, DatasetRoot, SourceOptions, Split, ViewIndices, open_source};
 use clift_eval::{Canvas, EncodeOptions, encode, upload_cameras};
 use clift_model::{DeviceName, Grouping, KMeans, ModelPath, TokenCount, TokenFormat, TrainedModel};
 

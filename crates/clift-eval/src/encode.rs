@@ -1,7 +1,8 @@
 //! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
-use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
+use clift_core::{Pose, PoseNormalization, derive_seed};
+use clift_data::{ClipReader, DataError, ViewIndices, contexts_along_path};
 use clift_model::{
     Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneNormalization, TokenCount, TokenKind,
     TrainedModel,
@@ -66,7 +67,7 @@ impl EncodedScene {
 /// path, as [`encode`] does without [`EncodeOptions::context`].
 ///
 /// # Errors
-/// Those of the cameras, and [`DataError::ZeroBaseline`](clift_data::DataError::ZeroBaseline) for frames without a scale.
+/// Those of the cameras, and [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
 pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, EvalError> {
     let (context, _) = contexts(reader, scene, None, num_views)?;
     Ok(context)
@@ -143,7 +144,8 @@ fn contexts(
     let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
     let frames = context_frames(&poses, requested, num_views)?;
     let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
+    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)
+        .map_err(DataError::from)?;
     Ok((frames, normalization))
 }
 

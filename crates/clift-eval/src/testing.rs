@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
-use clift_data::{ClipViews, Intrinsics, Pose};
+use clift_core::{Intrinsics, Pose};
+use clift_data::ClipViews;
 use clift_model::TokenCoding;
 use safetensors::{Dtype, SafeTensors};
 

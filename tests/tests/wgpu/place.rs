@@ -3,7 +3,8 @@
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose};
+use clift_core::{DMat3, DVec3, Intrinsics, Pose};
+use clift_data::{Clip, ClipViews};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{
     Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, LiftNorm, ModelConfig, Renderer,

@@ -3,7 +3,7 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use clift_data::{step_rng, uniform_below};
+use clift_core::{step_rng, uniform_below};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer, Tokens, Views, cluster_attention};
 use clift_train::{TrainError, seeded_clusters, seeded_uniform};

@@ -1,7 +1,7 @@
 //! The row of token selection, which runs on the host.
 
 use burn::tensor::Device;
-use clift_data::{DVec3, step_rng};
+use clift_core::{DVec3, step_rng};
 use clift_eval::view_cameras;
 use clift_model::{SelectionPreset, Selector, TokenRay, ViewCamera};
 use clift_train::TrainError;

@@ -5,7 +5,8 @@ use std::time::Instant;
 use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use clift_data::{ClipReader, Split, item_rng, median, open_dataset, step_rng};
+use clift_core::{item_rng, median, step_rng};
+use clift_data::{ClipReader, Split, open_dataset};
 use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{

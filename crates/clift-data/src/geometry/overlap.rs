@@ -2,8 +2,7 @@
 
 use glam::DVec3;
 
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
+use clift_core::{Camera, Pose};
 
 /// Rays along each side of the image.
 const SIDE: usize = 32;
@@ -47,8 +46,7 @@ fn is_seen(motion: Pose, direction: DVec3, to: &Camera) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
-    use crate::random::{step_rng, uniform_01};
+    use clift_core::{IntrinsicsNorm, step_rng, uniform_01};
     use glam::DMat3;
 
     fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera {

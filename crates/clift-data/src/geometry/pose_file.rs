@@ -6,13 +6,11 @@ use std::path::Path;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
+use clift_core::{Intrinsics, IntrinsicsNorm, PathView, Pose, PoseNormalization, check_near};
+
 use crate::error::DataError;
 use crate::files::bounded::parse_json;
 use crate::files::listing::natural_order;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
-use crate::geometry::camera_path::PathView;
-use crate::geometry::normalization::{PoseNormalization, check_near};
-use crate::geometry::pose::Pose;
 
 const MAX_POSES: usize = 100_000;
 /// Accepted focal lengths over width and height; the upper bound also limits the principal point's distance from 0.

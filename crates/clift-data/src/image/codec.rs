@@ -9,9 +9,10 @@ use image::codecs::png::PngEncoder;
 use image::metadata::Orientation;
 use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
+use clift_core::RgbImage;
+
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::image::rgb_image::RgbImage;
 
 /// Largest number of columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;

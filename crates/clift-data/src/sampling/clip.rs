@@ -2,8 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::camera::Intrinsics;
-use crate::geometry::pose::Pose;
+use clift_core::{Intrinsics, Pose};
 
 /// Context and target frames of a scene, as positions in the list of frames. Further fields of published evaluation indices are
 /// ignored.

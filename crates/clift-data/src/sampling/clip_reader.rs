@@ -3,11 +3,10 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use clift_core::{Camera, Intrinsics, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near};
+
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, Intrinsics};
-use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale, check_near};
 use crate::image::fit::fit_image;
-use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::{Clip, ClipViews, ViewIndices};
 use crate::scene_source::SceneSource;
 
@@ -41,8 +40,8 @@ impl ClipReader {
     ///
     /// # Errors
     /// [`DataError::NoSuchFrame`] for a position beyond the scene, [`DataError::InFrame`] around
-    /// [`DataError::BadCamera`] for a camera too far from the contexts, and the errors of reading cameras and frames, of
-    /// fitting ([`DataError::Upscale`]) and of normalising ([`DataError::ZeroBaseline`]).
+    /// [`DataError::Camera`] for a camera too far from the contexts, and the errors of reading cameras and frames, of
+    /// fitting ([`DataError::Upscale`]) and of normalising ([`DataError::Camera`]).
     pub fn read(&self, scene: usize, views: &ViewIndices) -> Result<Clip, DataError> {
         let key = self.source.key(scene);
         let cameras = self.source.cameras(scene)?;
@@ -87,9 +86,9 @@ impl ClipReader {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::Pose;
     use crate::scene_source::Split;
     use crate::testing::{TestSource, re10k_mini};
+    use clift_core::Pose;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     const OPTIONS: ClipOptions = ClipOptions {

@@ -2,8 +2,8 @@
 
 use glam::{DMat3, DVec3};
 
-use crate::geometry::camera::Intrinsics;
-use crate::geometry::pose::Pose;
+use clift_core::{Intrinsics, Pose};
+
 use crate::sampling::clip::{Clip, ClipViews};
 
 impl Clip {
@@ -45,13 +45,12 @@ fn mirrored_pose(Pose { rotation, translation }: Pose) -> Pose {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::normalization::{PoseRotation, PoseScale};
-    use crate::image::rgb_image::RgbImage;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::clip_reader::{ClipOptions, ClipReader};
     use crate::scene_source::SceneSource;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{TestSource, rooms};
+    use clift_core::{PoseRotation, PoseScale, RgbImage};
     use std::sync::Arc;
 
     fn mirrored(source: SyntheticSource) -> TestSource {

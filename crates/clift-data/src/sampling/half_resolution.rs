@@ -1,6 +1,7 @@
 //! Clips with half the columns and rows.
 
-use crate::geometry::camera::Intrinsics;
+use clift_core::Intrinsics;
+
 use crate::sampling::clip::{Clip, ClipViews};
 
 impl Clip {
@@ -36,7 +37,7 @@ impl ClipViews {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::Pose;
+    use clift_core::Pose;
 
     #[test]
     fn a_pixel_is_the_mean_of_two_by_two() {

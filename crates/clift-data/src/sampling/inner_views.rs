@@ -3,7 +3,7 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::random::sample_distinct;
+use clift_core::sample_distinct;
 
 /// Selection of the context frames between the first and the last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,7 +70,7 @@ fn farthest_points(left: usize, right: usize, count: usize, centres: &[[f64; 3]]
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
+    use clift_core::step_rng;
 
     fn choose(inner: InnerViews, left: usize, right: usize, count: usize, centres: &[[f64; 3]]) -> Vec<usize> {
         inner.choose(&mut step_rng(1, 2, "test"), left, right, count, centres)

@@ -1,7 +1,8 @@
 //! The scene of every batch slot: a function of (seed, step, slot) alone.
 
+use clift_core::{derive_seed, mix};
+
 use crate::error::{DataError, check_config};
-use crate::random::{derive_seed, mix};
 
 /// Rounds of the Feistel network behind [`SceneOrder`]. Four suffice in theory; more cost nothing.
 const FEISTEL_ROUNDS: u64 = 8;

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use clift_core::{item_rng, uniform_01};
+
 use crate::error::DataError;
-use crate::random::{item_rng, uniform_01};
 use crate::sampling::clip::{Clip, ViewIndices};
 use crate::sampling::scene_order::SceneOrder;
 use crate::sampling::slot_filler::{NoUsableScene, SlotFiller};
@@ -37,7 +38,7 @@ impl TrainingClips {
     /// Prepares batches of `batch_size` clips of the scenes of `source`, read by `read`.
     ///
     /// `seed` determines all random values. Each stage of a run needs its own seed
-    /// ([`derive_seed`](crate::random::derive_seed)).
+    /// ([`derive_seed`](clift_core::derive_seed)).
     ///
     /// # Errors
     /// [`DataError::BadConfig`] for an invalid sampler, a source without scenes and a `batch_size` of 0.
@@ -104,9 +105,9 @@ impl TrainingClips {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::Pose;
     use crate::sampling::clip::ClipViews;
     use crate::testing::Lengths;
+    use clift_core::Pose;
 
     fn clips(lengths: Vec<usize>, batch_size: usize, seed: u64) -> TrainingClips {
         let source = Arc::new(Lengths::new(lengths));

@@ -3,8 +3,9 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
+use clift_core::{sample_from, step_rng, uniform_below, uniform_between};
+
 use crate::error::{DataError, check_config};
-use crate::random::{sample_from, step_rng, uniform_below, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;

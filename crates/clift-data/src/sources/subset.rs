@@ -3,9 +3,9 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use clift_core::{Camera, RgbImage};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
 /// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.

@@ -5,9 +5,8 @@ use std::f64::consts::TAU;
 use glam::{DMat3, DVec3};
 use rand::Rng;
 
-use crate::geometry::camera::{Camera, IntrinsicsNorm};
-use crate::geometry::pose::Pose;
-use crate::random::uniform_01;
+use clift_core::{Camera, IntrinsicsNorm, Pose, uniform_01};
+
 use crate::synthetic::config::LookDirection;
 
 /// Smallest distance between the camera and any surface, in the scene's units of length.

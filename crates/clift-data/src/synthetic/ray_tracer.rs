@@ -5,8 +5,8 @@
 
 use glam::{DVec3, Vec3};
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
+use clift_core::{Camera, RgbImage};
+
 use crate::synthetic::room::{Object, Room, Shape, turned};
 use crate::synthetic::tracing::noise::smooth;
 
@@ -255,9 +255,9 @@ fn lamp_glow(room: &Room, hit: &Hit) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::texture::Texture;
+    use clift_core::step_rng;
 
     const RED: Vec3 = Vec3::new(1.0, 0.0, 0.0);
 

@@ -6,10 +6,9 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
+use clift_core::{Camera, RgbImage, step_rng};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
-use crate::random::step_rng;
 use crate::scene_source::{SceneSource, Split};
 use crate::synthetic::config::{Look, SyntheticConfig};
 use crate::synthetic::ray_tracer;

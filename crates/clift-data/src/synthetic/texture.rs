@@ -5,7 +5,8 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 use rand::Rng;
 
-use crate::random::{uniform_01, uniform_below};
+use clift_core::{uniform_01, uniform_below};
+
 use crate::synthetic::tracing::noise::smooth;
 
 /// Pattern in which the two colours alternate.

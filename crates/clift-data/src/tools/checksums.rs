@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use clift_core::{TEMPORARY, replace_file};
+
 use crate::error::DataError;
-use crate::files::atomic::{TEMPORARY, replace_file};
 use crate::files::listing::has_ending;
 
 /// Name of the file, in the format of `sha256sum`: a line per file with checksum and name.

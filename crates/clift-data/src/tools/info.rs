@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use rayon::prelude::*;
 use serde::Serialize;
 
+use clift_core::{Camera, MinMedianMax};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkippedScene;
-use crate::statistics::MinMedianMax;
 
 /// Largest number of scenes whose image size is read.
 const MAX_SIZED_SCENES: usize = 1000;

@@ -6,10 +6,10 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use clift_core::{Camera, derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
+
 use crate::error::{DataError, check_config};
-use crate::geometry::camera::Camera;
 use crate::geometry::overlap::overlap;
-use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, note_on};
@@ -166,11 +166,10 @@ pub fn write_overlap_index(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
-    use crate::geometry::pose::Pose;
     use crate::sampling::evaluation_index::EvaluationIndex;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{self, TestSource};
+    use clift_core::{IntrinsicsNorm, Pose};
     use glam::DMat3;
 
     fn rooms(num_scenes: usize) -> SyntheticSource {

@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 
 use half::{bf16, f16};
 
+use clift_core::replace_file;
+
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::file_kind::require_file;
 use crate::torch::pickle::Pickle;

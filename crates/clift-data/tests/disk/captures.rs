@@ -4,9 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use clift_data::{
-    FileOptions, IntrinsicsNorm, Lens, OpenedSource, RgbImage, SceneSource, Undistortion, decode_image, encode_png,
-};
+use clift_core::{IntrinsicsNorm, RgbImage};
+use clift_data::{FileOptions, Lens, OpenedSource, SceneSource, Undistortion, decode_image, encode_png};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 

@@ -3,9 +3,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use clift_core::{PoseRotation, PoseScale};
 use clift_data::{
-    Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, PoseRotation, PoseScale, SceneFilters, SceneSource,
-    SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
+    Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, SceneFilters, SceneSource, SourceInfo, SourceKind,
+    SourceOptions, Split, ViewIndices,
 };
 
 use crate::files::{copy_folder, copy_of_layout, layout};

@@ -6,7 +6,8 @@
 use std::ops::Range;
 
 use burn::tensor::Tensor;
-use clift_data::{Clip, ClipReader, EvaluationItem, derive_seed, item_rng, mean};
+use clift_core::{derive_seed, item_rng, mean};
+use clift_data::{Clip, ClipReader, EvaluationItem};
 use clift_model::{
     Cameras, Histograms, KMeans, LevelCounts, Moments, NeighbourProducts, Places, RateTable, TokenCodec, TokenCount,
     TokenKind, Tokens, TrainedModel, Transform,

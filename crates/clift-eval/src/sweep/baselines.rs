@@ -1,6 +1,7 @@
 //! Baselines: the nearest context view, and the mean of all context views.
 
-use clift_data::{ClipViews, Pose};
+use clift_core::Pose;
+use clift_data::ClipViews;
 
 use crate::error::EvalError;
 
@@ -48,7 +49,7 @@ pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{DMat3, DVec3};
+    use clift_core::{DMat3, DVec3};
 
     use super::*;
     use crate::testing::gray_views;

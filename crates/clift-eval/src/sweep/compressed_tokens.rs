@@ -2,7 +2,8 @@
 // N encoder tokens, S stored tokens, R rendered tokens, D width
 
 use burn::tensor::{Tensor, TensorData};
-use clift_data::{Clip, Pose, item_rng};
+use clift_core::{Pose, item_rng};
+use clift_data::Clip;
 use clift_model::{
     Scene, SceneNormalization, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes,
 };

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::time::Instant;
 
-use clift_data::{Clip, derive_seed, median};
+use clift_core::{derive_seed, median};
+use clift_data::Clip;
 use clift_model::{Cameras, FlopConvention, Grouping, TokenCoding, Tokens, TrainedModel, Views};
 
 use crate::config::method::Method;

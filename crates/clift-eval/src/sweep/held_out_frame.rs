@@ -1,6 +1,7 @@
 //! A check of an encoded scene: a frame that is no context, rendered and compared with the nearest context view.
 
-use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices};
+use clift_core::{Pose, PoseNormalization};
+use clift_data::{ClipReader, ViewIndices};
 use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel, ViewCamera};
 
 use crate::error::EvalError;
@@ -79,8 +80,10 @@ impl CheckViews {
     fn of_frames(reader: &ClipReader, index: usize, scene: &Scene, frames: &[usize]) -> Result<Self, EvalError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let cameras = reader.source.cameras(index)?;
-        let normalization =
-            PoseNormalization { mean_c2w: Pose::from_matrix(&scene.world.mean_c2w)?, scale: scene.world.scale };
+        let normalization = PoseNormalization {
+            mean_c2w: Pose::from_matrix(&scene.world.mean_c2w).map_err(clift_data::DataError::from)?,
+            scale: scene.world.scale,
+        };
         let mut clip = reader.read(index, &ViewIndices { context, target: frames.to_vec() })?;
         // The poses of the scene file: `reader` may normalize by the target too.
         for views in [&mut clip.context, &mut clip.target] {

@@ -3,7 +3,8 @@
 
 use std::time::Instant;
 
-use clift_data::{Clip, item_rng};
+use clift_core::item_rng;
+use clift_data::Clip;
 use clift_model::{ModelError, Selector, TokenRay};
 
 use crate::config::token_selection::Selection;
@@ -57,7 +58,8 @@ pub(crate) fn select_for_views(
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{ClipViews, Pose};
+    use clift_core::Pose;
+    use clift_data::ClipViews;
 
     use super::*;
     use crate::testing::gray_views;

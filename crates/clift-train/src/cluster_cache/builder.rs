@@ -7,7 +7,8 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, DataError, ViewIndices, derive_seed, item_rng, uniform_below};
+use clift_core::{derive_seed, item_rng, uniform_below};
+use clift_data::{ClipReader, DataError, ViewIndices};
 use clift_eval::upload_views;
 use clift_model::{Encoder, SceneClusters};
 

@@ -4,7 +4,8 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_folder, replace_file};
+use clift_core::{PoseRotation, PoseScale, TEMPORARY, publish_folder, replace_file};
+use clift_data::SourceKind;
 use clift_model::{CliftVariant, ModelConfig, ModelPath, TokenCodec, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
 

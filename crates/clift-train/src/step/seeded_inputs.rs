@@ -2,7 +2,8 @@
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
-use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose, item_rng, step_rng, uniform_below};
+use clift_core::{DMat3, DVec3, Intrinsics, Pose, item_rng, step_rng, uniform_below};
+use clift_data::{Clip, ClipViews};
 use clift_model::{Clift, ModelConfig, SceneClusters};
 use rand::{Rng, RngExt};
 

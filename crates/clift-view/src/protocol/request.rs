@@ -1,6 +1,6 @@
 //! Messages of the page: JSON text, checked before they reach the render thread.
 
-use clift_data::{Intrinsics, IntrinsicsNorm, MAX_COORDINATE, Pose};
+use clift_core::{Intrinsics, IntrinsicsNorm, MAX_COORDINATE, Pose};
 use clift_model::{Precision, SelectionPreset, ViewCamera};
 use serde::de::{Deserialize, Deserializer, Error};
 

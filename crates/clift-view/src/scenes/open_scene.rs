@@ -1,7 +1,7 @@
 //! A scene ready to render, with all that the page shows of it.
 
 use burn::tensor::Device;
-use clift_data::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
+use clift_core::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
 use clift_eval::{Canvas, available_bytes};
 use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, ViewCamera, frame_bytes};
 
@@ -117,13 +117,16 @@ pub fn scene_camera(frame: usize, camera: &ViewCamera, [width, height]: [usize; 
 /// Encodes an image as PNG.
 pub fn png(image: &Canvas) -> Result<Vec<u8>, ViewError> {
     let rgb = image.as_rgb8().to_vec();
-    let image = clift_data::RgbImage { width: image.width(), height: image.height(), rgb };
+    let image = clift_core::RgbImage { width: image.width(), height: image.height(), rgb };
     Ok(clift_data::encode_png(&image)?)
 }
 
 fn path_view(camera: &ViewCamera) -> Result<PathView, ViewError> {
     let [fx, fy, cx, cy] = camera.intrinsics;
-    Ok(PathView { c2w: Pose::from_matrix(&camera.c2w)?, intrinsics: Intrinsics { fx, fy, cx, cy } })
+    Ok(PathView {
+        c2w: Pose::from_matrix(&camera.c2w).map_err(clift_data::DataError::from)?,
+        intrinsics: Intrinsics { fx, fy, cx, cy },
+    })
 }
 
 /// Returns the sizes of whole patches that fit into half of the memory.

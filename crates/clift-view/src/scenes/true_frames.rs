@@ -1,6 +1,7 @@
 //! Frames of a run's scene that have a true image and are no contexts.
 
-use clift_data::{ClipReader, ClipViews, Pose, PoseNormalization, ViewIndices};
+use clift_core::{Pose, PoseNormalization};
+use clift_data::{ClipReader, ClipViews, ViewIndices};
 use clift_eval::{Canvas, view_cameras};
 use clift_model::{Scene, ViewCamera};
 
@@ -56,5 +57,8 @@ fn images(views: &ClipViews) -> Result<Vec<Canvas>, ViewError> {
 }
 
 fn normalization(scene: &Scene) -> Result<PoseNormalization, ViewError> {
-    Ok(PoseNormalization { mean_c2w: Pose::from_matrix(&scene.world.mean_c2w)?, scale: scene.world.scale })
+    Ok(PoseNormalization {
+        mean_c2w: Pose::from_matrix(&scene.world.mean_c2w).map_err(clift_data::DataError::from)?,
+        scale: scene.world.scale,
+    })
 }

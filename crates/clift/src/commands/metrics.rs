@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::replace_file;
+use clift_core::replace_file;
 use clift_train::Stage;
 use serde::Deserialize;
 

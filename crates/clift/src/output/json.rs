@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use clift_data::replace_file;
+use clift_core::replace_file;
 use serde::Serialize;
 
 /// Writes `value` as indented JSON, atomically.

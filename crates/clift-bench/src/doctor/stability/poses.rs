@@ -1,6 +1,7 @@
 //! Pose normalization of scenes whose cameras are far away or close together.
 
-use clift_data::{Pose, PoseNormalization, PoseRotation, PoseScale};
+use clift_core::{CameraError, Pose, PoseNormalization, PoseRotation, PoseScale};
+use clift_data::DataError;
 use clift_train::{ClipShape, TrainError, seeded_clip};
 
 use crate::cases::reference::largest_magnitude;
@@ -59,11 +60,11 @@ fn normalization_error(distance: f64, baseline: f64, in_f32: bool) -> Result<Out
     let away: Vec<Pose> = here.iter().map(moved).collect();
     let [here, away] = [here, away].map(|poses| {
         let frame = PoseNormalization::find("far", &poses, &[], PoseRotation::default(), PoseScale::default())?;
-        Ok(poses.iter().map(|pose| frame.normalize(*pose)).collect::<Vec<_>>())
+        Ok::<_, DataError>(poses.iter().map(|pose| frame.normalize(*pose)).collect::<Vec<_>>())
     });
     let away = match away {
         Ok(away) => away,
-        Err(clift_data::DataError::ZeroBaseline { .. }) => {
+        Err(DataError::Camera(CameraError::ZeroBaseline { .. })) => {
             return Ok(Outcome::Refused(away.expect_err("it is one").to_string()));
         }
         Err(other) => return Err(other.into()),

@@ -1,6 +1,7 @@
 //! Whole updates, loss and gradients, on extreme views.
 
-use clift_data::{Clip, ClipViews, MAX_COORDINATE};
+use clift_core::MAX_COORDINATE;
+use clift_data::{Clip, ClipViews};
 use clift_model::{Architecture, CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
 use clift_train::{ClipShape, Stage, StageBatch, TrainError, freeze, seeded_batch, seeded_model};
 

@@ -6,10 +6,10 @@ use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
+use clift_core::{Camera, RgbImage, widest_fov_deg};
+
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, widest_fov_deg};
 use crate::image::codec::decode_image;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::census::{Census, ChunkCensus, Progress, SceneCensus};

@@ -3,8 +3,9 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use clift_core::Camera;
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::image::codec::check_encoded;
 use crate::sources::chunks::writer::{camera_bytes, timestamp_bytes};
 use crate::torch::archive::{Archive, ByteSpan};

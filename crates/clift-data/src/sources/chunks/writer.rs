@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use clift_core::{Camera, replace_file};
+
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
-use crate::geometry::camera::Camera;
 use crate::torch::pickle_writer::PickleWriter;
 use crate::torch::values::{MAX_BYTES, MAX_VALUES};
 

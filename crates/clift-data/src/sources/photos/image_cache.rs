@@ -9,13 +9,13 @@ use std::time::UNIX_EPOCH;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use clift_core::{RgbImage, TEMPORARY};
+
 use crate::error::{DataError, check_config};
-use crate::files::atomic::TEMPORARY;
 use crate::files::caches::cache_folder;
 use crate::files::listing::has_ending;
 use crate::image::fit::covering_size;
 use crate::image::lanczos::resize_lanczos;
-use crate::image::rgb_image::RgbImage;
 use crate::sources::photos::photo::Photo;
 
 /// Start of a file; the number changes with the pixels that a photo gives.
@@ -187,12 +187,11 @@ fn read(path: &Path) -> Option<RgbImage> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
     use crate::geometry::lens::Lens;
-    use crate::geometry::pose::Pose;
     use crate::image::codec::{encode_jpeg, encode_png};
     use crate::image::fit::fit_image;
     use crate::testing::{names, ramp};
+    use clift_core::{IntrinsicsNorm, Pose};
 
     const K: IntrinsicsNorm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.52 };
 

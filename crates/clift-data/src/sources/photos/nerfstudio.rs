@@ -10,12 +10,12 @@ use std::path::Path;
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
+use clift_core::{Intrinsics, IntrinsicsNorm, Pose};
+
 use crate::error::DataError;
 use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::natural_order;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
-use crate::geometry::pose::Pose;
 use crate::image::codec::read_header;
 use crate::sources::photos::image_locator::ImageLocator;
 use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
@@ -192,6 +192,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
         let rows = entry.c2w_rows().map_err(in_frame)?;
         let photo = Pose::from_opengl(&rows)
+            .map_err(DataError::from)
             .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)))
             .map_err(PhotoScene::in_frame(path, name))?;
         scene.photos.push(photo);

@@ -4,13 +4,12 @@ use std::path::{Path, PathBuf};
 
 use image::metadata::Orientation;
 
+use clift_core::{Camera, IntrinsicsNorm, Pose, RgbImage};
+
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
-use crate::geometry::pose::Pose;
 use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
-use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
 pub(crate) const MAX_FRAMES: usize = 100_000;

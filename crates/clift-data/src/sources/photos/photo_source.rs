@@ -5,9 +5,9 @@ use std::sync::{Arc, Mutex};
 
 use rayon::prelude::*;
 
+use clift_core::{Camera, RgbImage, widest_fov_deg};
+
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, widest_fov_deg};
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;

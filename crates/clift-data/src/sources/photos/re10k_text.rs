@@ -3,9 +3,10 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use clift_core::Camera;
+
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::geometry::camera::Camera;
 use crate::sources::photos::image_folder::numbered_images;
 use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene};
 

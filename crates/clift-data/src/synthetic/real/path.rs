@@ -4,8 +4,8 @@ use std::f32::consts::TAU;
 
 use glam::{DMat3, Vec3};
 
-use crate::geometry::camera::{Camera, IntrinsicsNorm};
-use crate::geometry::pose::Pose;
+use clift_core::{Camera, IntrinsicsNorm, Pose};
+
 use crate::synthetic::real::dice::Dice;
 use crate::synthetic::tracing::noise::{byte, hash};
 use crate::synthetic::tracing::solid::Rays;

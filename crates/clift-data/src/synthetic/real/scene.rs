@@ -5,8 +5,8 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
+use clift_core::{Camera, RgbImage};
+
 use crate::synthetic::real::builder::{Builder, Place};
 use crate::synthetic::real::dice::Dice;
 use crate::synthetic::real::palette::color;
@@ -203,7 +203,7 @@ fn expose(dice: &mut Dice, world: &World, light: &Light, path: &Path) -> Exposur
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
+    use clift_core::step_rng;
 
     fn scene(number: u64) -> RealScene {
         RealScene::sample(step_rng(4, number, "test"))

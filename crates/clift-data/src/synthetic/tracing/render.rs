@@ -2,8 +2,8 @@
 
 use glam::{Vec3, Vec4};
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
+use clift_core::{Camera, RgbImage};
+
 use crate::synthetic::tracing::light::{End, Light};
 use crate::synthetic::tracing::solid::Rays;
 use crate::synthetic::tracing::world::{SKY, World};

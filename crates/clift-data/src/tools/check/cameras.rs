@@ -1,8 +1,7 @@
 //! Checks of intrinsics and poses without the images.
 
-use crate::geometry::camera::Camera;
-use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale};
-use crate::geometry::pose::Pose;
+use clift_core::{Camera, Pose, PoseNormalization, PoseRotation, PoseScale};
+
 use crate::tools::check::images::Sizes;
 use crate::tools::check::result::SceneCheck;
 

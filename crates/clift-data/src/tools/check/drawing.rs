@@ -2,7 +2,8 @@
 
 use glam::DMat3;
 
-use crate::image::rgb_image::RgbImage;
+use clift_core::RgbImage;
+
 use crate::tools::features::epipolar::{Correspondence, WIDTH, line, line_back};
 use crate::tools::features::image_features::reduced;
 

@@ -1,11 +1,10 @@
 //! Check of the poses against the images: matched corners must lie on each other's epipolar lines, and where other frames
 //! place them.
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
+use clift_core::{Camera, RgbImage, mean, median};
+
 use crate::scene_source::SceneSource;
 use crate::skip_report::plural;
-use crate::statistics::{mean, median};
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::frames::{exchange_neighbours, frame_distances, triplet_distances, wrong_frames};
 use crate::tools::check::images::Sizes;

@@ -5,8 +5,9 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use rayon::prelude::*;
 
+use clift_core::Camera;
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::features::image_features::Features;

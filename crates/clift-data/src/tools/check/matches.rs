@@ -2,7 +2,8 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::camera::Camera;
+use clift_core::Camera;
+
 use crate::tools::features::epipolar::Correspondence;
 use crate::tools::features::image_features::Features;
 

@@ -7,7 +7,8 @@ use std::collections::HashMap;
 
 use glam::DVec3;
 
-use crate::statistics::median;
+use clift_core::median;
+
 use crate::tools::check::matches::FramePair;
 use crate::tools::features::pixel_camera::PixelCamera;
 
@@ -110,8 +111,7 @@ fn transferred(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::{Camera, IntrinsicsNorm};
-    use crate::geometry::pose::Pose;
+    use clift_core::{Camera, IntrinsicsNorm, Pose};
     use glam::DMat3;
 
     #[test]

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 
-use crate::random::{step_rng, uniform_below};
+use clift_core::{step_rng, uniform_below};
 
 /// Number of columns to which wider images are reduced. Distances are in pixels of this width.
 pub const WIDTH: usize = 640;
@@ -127,10 +127,8 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::{Camera, IntrinsicsNorm};
-    use crate::geometry::pose::Pose;
-    use crate::random::uniform_01;
     use crate::tools::features::pixel_camera::PixelCamera;
+    use clift_core::{Camera, IntrinsicsNorm, Pose, uniform_01};
 
     /// Returns two overlapping cameras, and points that both see.
     fn scene(num_points: u64) -> ([Camera; 2], Vec<Correspondence>) {

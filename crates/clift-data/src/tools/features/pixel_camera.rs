@@ -2,8 +2,8 @@
 
 use glam::{DMat3, DVec3};
 
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
+use clift_core::{Camera, Pose};
+
 use crate::tools::features::epipolar::WIDTH;
 
 /// A camera of an image [`WIDTH`] columns wide, whose height keeps the shape of the pixels.

@@ -4,9 +4,9 @@ use std::fs;
 use std::path::PathBuf;
 
 use anyhow::Context;
+use clift_core::replace_file;
 use clift_data::{
-    CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, replace_file,
-    skipped_scenes,
+    CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, skipped_scenes,
 };
 use clift_eval::file_name;
 use serde::Serialize;

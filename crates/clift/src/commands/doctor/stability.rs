@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use clift_bench::{CaseSize, StabilityRow, outcome_text, run_stability, stability_markdown};
-use clift_data::replace_file;
+use clift_core::replace_file;
 use clift_model::DeviceName;
 
 use crate::output::stdout::{print_note, print_result};

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
-use clift_data::{is_empty_folder, median};
+use clift_core::{is_empty_folder, median};
 use clift_eval::{Animation, Canvas, Video};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;

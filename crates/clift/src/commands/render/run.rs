@@ -4,9 +4,10 @@ use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::{
-    Intrinsics, PathView, Pose, PoseNormalization, StagedDir, interpolate_path, mean_intrinsics, orbit_path, read_poses,
+use clift_core::{
+    Intrinsics, PathView, Pose, PoseNormalization, StagedDir, interpolate_path, mean_intrinsics, orbit_path,
 };
+use clift_data::read_poses;
 use clift_eval::available_bytes;
 use clift_model::{
     DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, RenderBudget, Scene,

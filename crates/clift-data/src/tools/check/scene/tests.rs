@@ -6,9 +6,9 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::*;
+use clift_core::{Camera, Pose};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
 use crate::testing;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, Verdict};
 

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::error::DataError;
+use crate::error::CameraError;
 use crate::geometry::pose::Pose;
 
 /// Pinhole intrinsics in pixels of one image. The centre of the pixel in column `i` and row `j` is
@@ -36,17 +36,17 @@ impl IntrinsicsNorm {
     /// Checks that focal lengths are positive and all numbers finite.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] with the first number that fails.
-    pub fn validate(self) -> Result<(), DataError> {
+    /// [`CameraError::BadCamera`] with the first number that fails.
+    pub fn validate(self) -> Result<(), CameraError> {
         let Self { fx, fy, cx, cy } = self;
         for (name, focal) in [("fx", fx), ("fy", fy)] {
             if !(focal.is_finite() && focal > 0.0) {
-                return Err(DataError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
+                return Err(CameraError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
             }
         }
         for (name, centre) in [("cx", cx), ("cy", cy)] {
             if !centre.is_finite() {
-                return Err(DataError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
+                return Err(CameraError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
             }
         }
         Ok(())
@@ -79,8 +79,8 @@ impl Camera {
     /// (ignored), then `w2c` as 3 x 4, row-major, OpenCV axes. `c2w` is the matrix inverse of `w2c`.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
-    pub fn from_re10k(row: [f64; 18]) -> Result<Self, DataError> {
+    /// [`CameraError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
+    pub fn from_re10k(row: [f64; 18]) -> Result<Self, CameraError> {
         let [fx, fy, cx, cy, ..] = row;
         let intrinsics_norm = IntrinsicsNorm { fx, fy, cx, cy };
         intrinsics_norm.validate()?;
@@ -107,7 +107,7 @@ impl Camera {
 }
 
 /// Returns the largest field of view of the cameras along either axis, in degrees; 0 for no cameras.
-pub(crate) fn widest_fov_deg(cameras: &[Camera]) -> f64 {
+pub fn widest_fov_deg(cameras: &[Camera]) -> f64 {
     cameras.iter().map(Camera::fov_deg).fold(0.0, |widest, (x, y)| widest.max(x).max(y))
 }
 
