@@ -153,7 +153,7 @@ class Bench:
             found = json.loads(finished.stdout)
         else:
             written = json.loads((self.folder / "ours.json").read_text())
-            found = next((row for row in written["rows"] if row["work"] == side.work), None)
+            found = next((row for row in written["rows"] if row["case"] == side.work), None)
             if found is None:
                 raise CommandFailed(f"no row `{side.work}` in the JSON of `{' '.join(command)}`")
             if written.get("threads", self.args.threads) != self.args.threads:

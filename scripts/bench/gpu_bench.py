@@ -111,7 +111,7 @@ class Bench:
         written = json.loads(self.json.read_text())
         if written["precision"] != precision or written["device"] != self.args.device:
             raise Failed(f"clift measured {written['device']} in {written['precision']}")
-        return next(one["samples_s"] for one in written["rows"] if one["work"] == row.work)
+        return next(one["samples_s"] for one in written["rows"] if one["case"] == row.work)
 
     def precision(self) -> list[dict[str, Any]] | str:
         """What f16 products change, from `clift bench precision`."""
@@ -179,7 +179,7 @@ def precision_table(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         loss = ", ".join(f"{value:.6f}" for value in row["loss"]) if row.get("loss") else "-"
         psnr = f"{row['psnr_to_f32']:.1f} dB" if row.get("psnr_to_f32") is not None else "-"
-        lines.append([row["work"], f"{row['ratio']:.2f}", f"{row['error']:.1e}", loss, psnr])
+        lines.append([row["case"], f"{row['ratio']:.2f}", f"{row['error']:.1e}", loss, psnr])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

@@ -80,7 +80,7 @@ def table(title: str, evaluations: list[list[dict]]) -> None:
     found: dict[tuple, list[dict]] = {}
     for points in evaluations:
         for point in points:
-            key = (point["variant"], FORMATS.index(point["tokens"]), point["num_storage_tokens"])
+            key = (point["method"], FORMATS.index(point["tokens"]), point["num_storage_tokens"])
             found.setdefault(key, []).append(point)
     print(f"\n{title}\n\n| method | tokens | storage | seeds | PSNR dB | SSIM | values | kB | GMAC | ms a view |")
     print("|---|---|---|---|---|---|---|---|---|---|")
@@ -95,11 +95,11 @@ def table(title: str, evaluations: list[list[dict]]) -> None:
         )
 
 
-def curve(evaluations: list[list[dict]], variant: str) -> list[tuple[float, float]]:
+def curve(evaluations: list[list[dict]], method: str) -> list[tuple[float, float]]:
     """Mean PSNR of a method in f16 by the number of stored tokens."""
     found: dict[int, list[float]] = {}
     for point in (point for points in evaluations for point in points):
-        if point["variant"] == variant and point["tokens"] == "f16":
+        if point["method"] == method and point["tokens"] == "f16":
             found.setdefault(point["num_storage_tokens"], []).append(point["psnr"])
     return sorted((tokens, statistics.fmean(psnr)) for tokens, psnr in found.items())
 

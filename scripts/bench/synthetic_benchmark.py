@@ -92,12 +92,12 @@ class Seed:
 
 
 def scene_means(folder: Path) -> dict[tuple[str, int], dict[str, float]]:
-    """Mean PSNR of every scene by (variant, tokens), of views rendered from all tokens."""
+    """Mean PSNR of every scene by (method, tokens), of views rendered from all tokens."""
     values: dict[tuple[str, int], dict[str, list[float]]] = {}
     with (folder / "views.csv").open(newline="") as file:
         for row in csv.DictReader(file):
             if row["num_storage_tokens"] == row["num_render_tokens"]:
-                scenes = values.setdefault((row["variant"], int(row["num_storage_tokens"])), {})
+                scenes = values.setdefault((row["method"], int(row["num_storage_tokens"])), {})
                 scenes.setdefault(row["scene"], []).append(min(float(row["psnr"]), 100.0))
     return {key: {scene: statistics.fmean(v) for scene, v in scenes.items()} for key, scenes in values.items()}
 

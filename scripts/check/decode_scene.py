@@ -1,4 +1,4 @@
-"""Decodes a scene file with coded tokens (versions 3 to 5), as docs/reference/files.md describes it.
+"""Decodes a scene file with coded tokens (version 5), as docs/reference/files.md describes it.
 
 usage: decode_scene.py SCENE.clift CODEC.safetensors [--write FILE | --check FILE]
 
@@ -84,15 +84,14 @@ def neighbours(ids, rows, columns):
 def decode(scene_path, codec_path):
     data, fields, scene = open_safetensors(scene_path)
     _, info, codec = open_safetensors(codec_path)
-    assert fields["version"] in "345" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
-    body, version, count = scene["scene"].tobytes(), fields["version"], int(fields["tokens"])
-    sizes = fields["views"].split("x") if version == "5" else [fields[name] for name in ("views", "height", "width")]
-    patch, (views, height, width) = json.loads(info["model"])["patch_size"], map(int, sizes)
+    assert fields["version"] == "5" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
+    body, count = scene["scene"].tobytes(), int(fields["tokens"])
+    patch, (views, height, width) = json.loads(info["model"])["patch_size"], map(int, fields["views"].split("x"))
     rows, columns = height // patch, width // patch
     patches = views * rows * columns
     step = float(np.frombuffer(body[:4], "<f4")[0])
-    start = 4 + (48 if version == "5" else 13 * 8)
-    start += views * 68 if version == "3" else 4 + 16 * struct.unpack_from("<I", body, start)[0] + views * 32
+    (num_intrinsics,) = struct.unpack_from("<I", body, 4 + 48)
+    start = 4 + 48 + 4 + 16 * num_intrinsics + 32 * views
     decoder = Decoder(np.frombuffer(body[start:-4], "<u4").tolist())
     ids = []
     for index in range(patches):
@@ -101,9 +100,7 @@ def decode(scene_path, codec_path):
         if left == rest or (left > 0 and decoder.next([0, size, TOTAL]) == 0):
             ids.append(index)
     knots, deviations = codec["knots"].astype(float), codec["deviations"].astype(float)
-    levels, groups = np.zeros((count, len(deviations))), len(LIMITS) + 2
-    weights = codec.get("weights", np.zeros((groups, len(deviations), 2))).astype(float)
-    scales = codec.get("scales", np.ones((groups, len(deviations)))).astype(float)
+    levels, weights, scales = np.zeros((count, len(deviations))), codec["weights"].astype(float), codec["scales"].astype(float)
     near = neighbours(ids, rows, columns)
     for direction, deviation in enumerate(deviations):
         ratio, reach = step / deviation, np.abs(weights[:, direction]).sum(1)

@@ -33,7 +33,8 @@ const CRATES: [Crate; 9] = [
     (
         "clift-train",
         "clift-core clift-kernels clift-model clift-data clift-eval",
-        "error distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
+        "error version distributed events config step cluster_cache interchange stage checkpoint footprint \
+         fit_token_codec run",
     ),
     (
         "clift-bench",

@@ -376,7 +376,7 @@ pub fn number(value: &Value, key: &str) -> f64 {
 /// The first point of an evaluation with these values.
 #[track_caller]
 pub fn point<'a>(points: &'a [Value], variant: &str, num_storage_tokens: usize) -> &'a Value {
-    let is_it = |point: &&Value| point["variant"] == variant && point["num_storage_tokens"] == num_storage_tokens;
+    let is_it = |point: &&Value| point["method"] == variant && point["num_storage_tokens"] == num_storage_tokens;
     points.iter().find(is_it).unwrap_or_else(|| panic!("no {variant} of {num_storage_tokens} tokens"))
 }
 

@@ -37,7 +37,6 @@ pub struct PrecisionReport {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PrecisionRow {
     /// The case.
-    #[serde(rename = "work")]
     pub case: BenchCase,
     /// Median seconds with f32 products.
     pub f32_s: f64,

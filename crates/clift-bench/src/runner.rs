@@ -42,7 +42,6 @@ pub struct BenchReport {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BenchRow {
     /// The case.
-    #[serde(rename = "work")]
     pub case: BenchCase,
     /// Median of the samples.
     pub median_s: f64,

@@ -8,7 +8,7 @@ use clift_core::{PoseRotation, PoseScale};
 
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
-use crate::sampling::view_sampler::{ViewSampler, is_default};
+use crate::sampling::view_sampler::ViewSampler;
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
@@ -34,13 +34,9 @@ pub struct DataConfig {
     /// Cameras that define the scale of a scene: the `context` views, or `all`, contexts and targets (as in the authors'
     /// released code).
     pub pose_scale: PoseScale,
-    /// Older form of `crop = "exact"`.
-    pub exact_principal_point: bool,
     /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
-    #[serde(skip_serializing_if = "is_default")]
     pub crop: Crop,
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub flip: bool,
     /// Where a data set has no test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
     /// never read in training, as in the practice of `NeRF`; 0 holds out no frame, and training scenes are evaluated.
@@ -69,7 +65,6 @@ impl Default for DataConfig {
             height: 256,
             pose_rotation: PoseRotation::default(),
             pose_scale: PoseScale::default(),
-            exact_principal_point: false,
             crop: Crop::Protocol,
             flip: false,
             hold_out: 8,
@@ -102,7 +97,7 @@ impl DataConfig {
             height: self.height,
             pose_rotation: self.pose_rotation,
             pose_scale: self.pose_scale,
-            exact_principal_point: self.exact_principal_point || self.crop == Crop::Exact,
+            exact_principal_point: self.crop == Crop::Exact,
         }
     }
 }

@@ -10,28 +10,30 @@ use crate::sampling::clip_reader::ClipReader;
 use crate::sampling::training_clips::ReadClip;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
+use crate::sources::chunks::chunk_source::ScanProgress;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
-use crate::sources::open::{OpenedSource, open_source};
+use crate::sources::open::{OpenedSource, scan_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 
-/// Opens one split of the data set of a config.
+/// Opens one split of the data set of a config. `progress` is called with the numbers of examined and of all chunks while
+/// `data.filters` read the chunks: the first opening of a large data set can take minutes.
 ///
 /// # Errors
 /// The errors of opening the source, [`DataError::BadConfig`] for a missing key, and [`DataError::NoScenes`] when the
 /// filters skip every scene.
-pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, DataError> {
+pub fn open_dataset(config: &DataConfig, split: Split, progress: ScanProgress<'_>) -> Result<OpenedSource, DataError> {
     let opened = match config.source {
         SourceKind::Synthetic => {
             let source = SyntheticSource::new(SyntheticConfig { split, ..config.synthetic.clone() })?;
             let report = SkipReport::new(source.num_scenes());
             OpenedSource { source: Arc::new(source), kind: config.source, shares_scenes: false, report }
         }
-        kind => open_files(config, kind, split)?,
+        kind => open_files(config, kind, split, progress)?,
     };
     if opened.source.num_scenes() == 0 {
         return Err(DataError::NoScenes { reason: format!("{split}: {}", opened.report) });
@@ -39,7 +41,12 @@ pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, D
     Ok(opened)
 }
 
-fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<OpenedSource, DataError> {
+fn open_files(
+    config: &DataConfig,
+    kind: SourceKind,
+    split: Split,
+    progress: ScanProgress<'_>,
+) -> Result<OpenedSource, DataError> {
     let missing = |key: &str, fix: &str| DataError::bad_config(key, format!("is missing; {fix}"));
     let root = config.root.as_deref();
     let root = root.ok_or_else(|| missing("data.root", "write the folder of the data set or capture"))?;
@@ -52,7 +59,7 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
         image_cache: Some(config.image_cache.clone()),
         reads_chunks: false,
     };
-    let mut opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
+    let mut opened = scan_source(&DatasetRoot::find(root)?, split, &options, progress)?;
     let source = &opened.source;
     let has_dl3dv = || (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene)));
     let is_divided = !opened.shares_scenes || config.files.test_scenes.is_some();
@@ -75,8 +82,12 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
 ///
 /// # Errors
 /// As [`open_dataset`].
-pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<OpenedSource, DataError> {
-    let mut opened = open_dataset(config, Split::Train)?;
+pub fn open_training_dataset(
+    config: &DataConfig,
+    last_step: u64,
+    progress: ScanProgress<'_>,
+) -> Result<OpenedSource, DataError> {
+    let mut opened = open_dataset(config, Split::Train, progress)?;
     opened.source = opened.training_source(config.hold_out);
     let source = opened.source.clone();
     let needed = config.views.min_frames(last_step);
@@ -133,7 +144,7 @@ mod tests {
         let scene = &mut data.synthetic;
         (scene.num_scenes, scene.num_frames, scene.width, scene.height) = (2, 8, 64, 32);
         let read = |data: &DataConfig| {
-            let source = open_dataset(data, Split::Train).unwrap().source;
+            let source = open_dataset(data, Split::Train, &mut |_, _| ()).unwrap().source;
             let reader = ClipReader { source, options: data.clip_options() };
             let half = half_resolution_clips(data, &reader).unwrap();
             (half(1, &views).unwrap(), reader.read(1, &views).unwrap().at_half_resolution())
@@ -182,20 +193,20 @@ mod tests {
         };
         let mut data = DataConfig { views, source: SourceKind::Chunks, ..DataConfig::default() };
         data.root = Some(folder.path().to_owned());
-        assert_eq!(open_training_dataset(&data, 0).unwrap().source.num_scenes(), 3);
-        let OpenedSource { source, report, .. } = open_training_dataset(&data, 2).unwrap();
+        assert_eq!(open_training_dataset(&data, 0, &mut |_, _| ()).unwrap().source.num_scenes(), 3);
+        let OpenedSource { source, report, .. } = open_training_dataset(&data, 2, &mut |_, _| ()).unwrap();
         assert_eq!((source.num_scenes(), source.key(0), source.find("of-8")), (2, "of-5", Some(1)));
         let expected = "2 of 3 scenes used; 1 shorter than the 5 frames that data.views.min_gap needs";
         assert_eq!(report.to_string(), expected);
         assert_eq!(report.skips[0].key, "of-4");
-        let OpenedSource { source, report, .. } = open_training_dataset(&data, 4).unwrap();
+        let OpenedSource { source, report, .. } = open_training_dataset(&data, 4, &mut |_, _| ()).unwrap();
         assert_eq!((source.num_scenes(), source.key(0)), (1, "of-8"));
         assert!(report.to_string().contains("2 shorter than the 6 frames"), "{report}");
         let too_short = data.views.sample_frames(5, &[], 4, 4, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
         assert_eq!(too_short.to_string(), "not enough frames: 6 needed, 5 in the scene");
-        assert_eq!(open_dataset(&data, Split::Train).unwrap().source.num_scenes(), 3);
+        assert_eq!(open_dataset(&data, Split::Train, &mut |_, _| ()).unwrap().source.num_scenes(), 3);
         data.views = ViewSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
-        let message = open_training_dataset(&data, 0).err().unwrap().to_string();
+        let message = open_training_dataset(&data, 0, &mut |_, _| ()).err().unwrap().to_string();
         assert!(message.contains("train: 0 of 3 scenes used; 3 shorter than the 10 frames"), "{message}");
     }
 }

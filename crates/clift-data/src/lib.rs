@@ -7,7 +7,7 @@
 //! use clift_data::{ClipReader, DataConfig, Split, ViewIndices, open_dataset};
 //!
 //! let config = DataConfig { width: 32, height: 24, ..DataConfig::default() }; // synthetic rooms
-//! let opened = open_dataset(&config, Split::Train)?;
+//! let opened = open_dataset(&config, Split::Train, &mut |_, _| ())?;
 //! println!("{}", opened.report); // skipped scenes and frames
 //!
 //! let reader = ClipReader { source: opened.source, options: config.clip_options() };
@@ -40,8 +40,7 @@ pub use scene_source::{SceneSource, Split};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
 
 // Layouts on disk, and synthetic scenes.
-pub use sources::chunks::census::observe_census;
-pub use sources::chunks::chunk_source::ChunkSource;
+pub use sources::chunks::chunk_source::{ChunkSource, ScanProgress};
 pub use sources::chunks::writer::{SceneRecord, write_chunks};
 pub use sources::dataset_root::DatasetRoot;
 pub use sources::filters::SceneFilters;
@@ -82,7 +81,7 @@ pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, sk
 pub use tools::checksums::hash_file;
 pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
 pub use tools::export::{ImageEncoding, read_scene, write_evaluation_index, write_source};
-pub use tools::index_census::IndexCensus;
+pub use tools::index_statistics::IndexStatistics;
 pub use tools::info::SourceInfo;
 pub use tools::overlap_index::{OverlapOptions, write_overlap_index};
 

@@ -59,7 +59,7 @@ pub enum EvalError {
     )]
     NoPredictions {
         /// Name of the method.
-        name: &'static str,
+        name: String,
         /// Number of target images.
         expected: usize,
         /// Path of the first target image in the folder.
@@ -88,7 +88,7 @@ pub enum EvalError {
     #[error("no weights for the method `{method}`")]
     NoModel {
         /// Name of the method.
-        method: &'static str,
+        method: String,
     },
     /// No scene is left to evaluate.
     #[error("no usable scene: {reason}")]

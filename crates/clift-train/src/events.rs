@@ -58,6 +58,13 @@ pub struct StepEvent {
 /// An event of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
+    /// Chunks of a data set were examined for its filters.
+    Scan {
+        /// Number of examined chunks.
+        done: usize,
+        /// Number of all chunks.
+        total: usize,
+    },
     /// A stage starts or resumes.
     StageStarted {
         /// The stage.

@@ -33,6 +33,7 @@ mod stage;
 mod step;
 #[cfg(test)]
 mod testing;
+mod version;
 
 // Configuration
 pub use config::config::{

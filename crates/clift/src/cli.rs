@@ -232,20 +232,6 @@ mod tests {
     }
 
     #[test]
-    fn old_words_are_accepted() {
-        for line in [
-            "bench a.toml --work encode",
-            "bench half a.toml --work encode",
-            "compare a b --variants kmeans,clift:int8",
-            "data check a --pictures b",
-            "eval run --select random",
-        ] {
-            let parsed = Args::try_parse_from(["clift"].into_iter().chain(line.split(' ')));
-            assert!(parsed.is_ok(), "{line}: {}", parsed.unwrap_err());
-        }
-    }
-
-    #[test]
     fn wrong_command_lines_are_refused() {
         for line in [
             "train a.toml --overfit 0",

@@ -31,7 +31,6 @@ use crate::commands::{
     train, view,
 };
 use crate::exit_code::{DONE, error_message, exit_code};
-use crate::output::counter::count_chunks;
 use crate::output::stdout;
 
 /// Runs the command line of this process and returns the exit code: 0 done, 1 failed, 2 invalid command line, config or
@@ -43,7 +42,6 @@ pub fn main() -> ExitCode {
     if Launched::find().num_ranks == 1 {
         threads::start(None);
     }
-    clift_data::observe_census(count_chunks);
     let result = match args.command {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),

@@ -30,7 +30,7 @@ fn evaluate(place: &Place, model: &str, out: &str, flags: &str) -> serde_json::V
 }
 
 fn variants(summary: &serde_json::Value) -> BTreeSet<&str> {
-    list(&summary["points"]).iter().map(|point| point["variant"].as_str().unwrap()).collect()
+    list(&summary["points"]).iter().map(|point| point["method"].as_str().unwrap()).collect()
 }
 
 #[test]

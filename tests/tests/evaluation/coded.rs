@@ -19,7 +19,7 @@ fn coded_files_have_the_size_and_quality_of_the_evaluation() {
     let points = place.points("coded");
     let of = |tokens: &str, count: usize| {
         let is_it = |point: &&serde_json::Value| {
-            point["variant"] == "clift" && point["tokens"] == tokens && point["num_storage_tokens"] == count
+            point["method"] == "clift" && point["tokens"] == tokens && point["num_storage_tokens"] == count
         };
         points.iter().find(is_it).unwrap_or_else(|| panic!("no {tokens}, {count}: {points:?}"))
     };
@@ -37,7 +37,7 @@ fn coded_files_have_the_size_and_quality_of_the_evaluation() {
         assert!(number(of(tokens, 8), "scene_bytes") < 0.5 * number(of("f32", 8), "scene_bytes"));
     }
     assert!(number(of("coded-1", 8), "scene_bytes") < number(of("coded", 8), "scene_bytes"));
-    assert!(points.iter().all(|point| point["variant"] == "clift" || point["tokens"] != "coded"));
+    assert!(points.iter().all(|point| point["method"] == "clift" || point["tokens"] != "coded"));
     place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/out").ok();
 }
 

@@ -62,7 +62,7 @@ fn every_format_and_count_has_speed_and_fronts() {
     ran.prints("t: no other point has a higher PSNR");
     let points = place.points("formats");
     let of = |variant: &str, format: &str| {
-        points.iter().filter(move |point| point["variant"] == variant && point["tokens"] == format).count()
+        points.iter().filter(move |point| point["method"] == variant && point["tokens"] == format).count()
     };
     for format in ["f32", "f16", "int8"] {
         // 8 and 4 of 8, 4 and 2 of 4.
@@ -108,8 +108,8 @@ fn predictions_are_scored_and_missing_images_named() {
     let missing = format!("{}/{:0>6}.png", views[0].0, views[0].1);
     ran.prints("Grey&co: 1 of 6 images are missing").prints(&missing);
     let summary = place.json("run/eval/summary.json");
-    assert_eq!(summary["missing"][0]["pictures"], serde_json::json!([missing]));
-    let point = list(&summary["points"]).iter().find(|point| point["variant"] == "Grey&co").unwrap();
+    assert_eq!(summary["missing"][0]["images"], serde_json::json!([missing]));
+    let point = list(&summary["points"]).iter().find(|point| point["method"] == "Grey&co").unwrap();
     assert_eq!((&point["num_views"], &point["scene_bytes"]), (&5.into(), &1500.into()));
     assert!((5.0..40.0).contains(&number(point, "psnr")), "{point}");
     assert!(place.text("run/eval/report.html").contains("Grey&amp;co"));
@@ -207,7 +207,7 @@ fn two_evaluations_are_compared_pair_by_pair() {
         }
         for run in ["a", "b"] {
             let points = place.points(&format!("{run}/eval"));
-            let keys = ["variant", "num_storage_tokens", "num_render_tokens"];
+            let keys = ["method", "num_storage_tokens", "num_render_tokens"];
             let point = points.iter().find(|point| keys.iter().all(|key| point[key] == pair["a"][key]));
             let psnr = number(point.unwrap(), "psnr");
             assert!((psnr - of_pair(run)).abs() < 1e-9, "the mean over scenes of the summary");
@@ -231,7 +231,7 @@ fn the_papers_counts_come_out_of_the_command() {
     place.clift("flops REPO/configs/tiny.toml --render 16,1.0 --json DIR/flops.json").ok();
     let counts = place.json("flops.json");
     assert_eq!((&counts["convention"], &counts["num_tokens"]), (&"macs".into(), &256.into()));
-    let rendered = list(&counts["rows"]).iter().filter(|row| row["work"] == "render");
+    let rendered = list(&counts["rows"]).iter().filter(|row| row["case"] == "render");
     assert_eq!(rendered.map(|row| &row["num_tokens"]).collect::<Vec<_>>(), [16, 256]);
     place.clift("flops --convention flop").fails_with(2, &["flop"]);
     place.clift("flops --render 5000").fails_with(2, &["a scene has 4096 tokens"]);

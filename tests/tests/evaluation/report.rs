@@ -45,7 +45,7 @@ fn selected_tokens_have_rows_with_both_times() {
         let counts = |point: &serde_json::Value| {
             ["num_storage_tokens", "num_render_tokens"].map(|key| point[key].as_u64().expect("a count"))
         };
-        let kmeans: Vec<_> = points.iter().filter(|point| point["variant"] == "kmeans").collect();
+        let kmeans: Vec<_> = points.iter().filter(|point| point["method"] == "kmeans").collect();
         let settings: Vec<[u64; 2]> = kmeans.iter().map(|point| counts(point)).collect();
         // Two is half of four: once.
         assert_eq!(settings, [[4, 2], [4, 4], [8, 2], [8, 4], [8, 8]]);

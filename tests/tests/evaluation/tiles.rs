@@ -25,7 +25,7 @@ fn tiles_and_clusters_have_paired_differences() {
     let pairs = [["kmeans", "tile"], ["tile_clift", "tile"], ["clift", "kmeans"], ["clift", "tile_clift"]];
     assert_eq!(differences.len(), pairs.len(), "{summary}");
     for [variant, against] in pairs {
-        let difference = differences.iter().find(|d| d["variant"] == variant && d["against"] == against).unwrap();
+        let difference = differences.iter().find(|d| d["method"] == variant && d["against"] == against).unwrap();
         // Every scene has the same number of views, so that the difference of the means is the mean difference.
         let expected = psnr(variant) - psnr(against);
         assert!((number(difference, "psnr") - expected).abs() < 1e-9, "{difference}, {expected}");
@@ -34,7 +34,7 @@ fn tiles_and_clusters_have_paired_differences() {
 
     // Without condenser both are of stage 1, which the two runs share: the tiles' own evaluation agrees.
     let own = place.points("tiles/eval");
-    let names: Vec<_> = own.iter().map(|point| point["variant"].as_str().unwrap()).collect();
+    let names: Vec<_> = own.iter().map(|point| point["method"].as_str().unwrap()).collect();
     assert!(!names.contains(&"clift") && names.contains(&"tile_clift"), "{names:?}");
     assert_eq!(number(point(&own, "tile", 4), "psnr"), psnr("tile"));
 }

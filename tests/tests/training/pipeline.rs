@@ -36,7 +36,7 @@ fn a_run_writes_every_documented_file() {
     ran.notes(&format!("--set run_dir: \"runs/micro\" -> {:?}\n", place.at("run")));
     let config = place.text("run/config.toml");
     // Resolved: overrides, and defaults that neither the file nor an override names.
-    for line in ["steps = 6", "dim = 16", "max_grad_norm = 1.0", "exact_principal_point = false"] {
+    for line in ["steps = 6", "dim = 16", "max_grad_norm = 1.0", "crop = \"protocol\""] {
         assert!(config.contains(line), "{line}: {config}");
     }
     assert_eq!(place.json("run/run.json"), serde_json::json!({"version": 1, "overfit": null}));
@@ -76,7 +76,7 @@ fn a_run_writes_every_documented_file() {
         assert!(number(baseline, "psnr") > 5.0 && baseline["ssim"].is_f64(), "{baseline}");
     }
     let points = list(&summary["points"]);
-    let settings = points.iter().map(|point| (point["variant"].as_str(), point["num_storage_tokens"].as_u64()));
+    let settings = points.iter().map(|point| (point["method"].as_str(), point["num_storage_tokens"].as_u64()));
     let expected = ["clift", "kmeans", "random"].map(|variant| [4, 8].map(|count| (Some(variant), Some(count))));
     assert_eq!(settings.collect::<Vec<_>>(), expected.concat());
     for point in points {

@@ -52,7 +52,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let views = ViewSampler { min_context: 2, max_context: 2, ..ViewSampler::default() };
     let data = DataConfig { height, width, synthetic, views, ..DataConfig::default() };
     let config = Config { data, model: network(CliftVariant::Paper), ..Config::default() };
-    let source = open_dataset(&config.data, Split::Test).expect("rooms are made").source;
+    let source = open_dataset(&config.data, Split::Test, &mut |_, _| ()).expect("rooms are made").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let trained = TrainedModel::snapshot(&place.model().valid(), &config.model, true);
     let options = EncodeOptions {

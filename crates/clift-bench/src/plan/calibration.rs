@@ -246,7 +246,7 @@ pub fn inference_rates(
 
 /// Returns the seconds that one thread takes to read a view of a training scene; `None` if the data cannot be read.
 pub fn loading_s(config: &Config) -> Option<f64> {
-    let source = open_dataset(&config.data, Split::Train).ok()?.source;
+    let source = open_dataset(&config.data, Split::Train, &mut |_, _| ()).ok()?.source;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = &config.data.views;
     let num_scenes = reader.source.num_scenes().min(6);

@@ -137,7 +137,7 @@ mod tests {
         clips((0..40).map(|scene| if scene % 3 == 0 { 10 } else { 200 }).collect(), 4, 9)
     }
 
-    /// Checksums of the batches of the version before `SlotFiller`.
+    /// Reference checksums of the batches.
     #[test]
     fn first_thousand_batches_are_reproducible() {
         let rare = (0..300).map(|scene| if scene % 23 == 5 { 90 } else { 10 + scene % 17 }).collect();

@@ -48,13 +48,7 @@ pub struct ViewSampler {
     /// Whether targets may repeat. A target may also be a context frame in both cases.
     pub with_replacement: bool,
     /// Selection of the contexts between the two ends: `random`, `farthest_point` or `even`.
-    #[serde(skip_serializing_if = "is_default")]
     pub inner: InnerViews,
-}
-
-/// Returns whether the value is the default, which files omit: caches from before the key then compare equal.
-pub(crate) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
-    *value == T::default()
 }
 
 impl Default for ViewSampler {

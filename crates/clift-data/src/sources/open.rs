@@ -9,9 +9,9 @@ use crate::files::caches::cache_folder;
 use crate::files::listing::file_names;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
-use crate::sources::chunks::census::Census;
-use crate::sources::chunks::chunk_source::ChunkSource;
+use crate::sources::chunks::chunk_source::{ChunkSource, ScanProgress};
 use crate::sources::chunks::index::{index_of_files, note_unlisted, read_index};
+use crate::sources::chunks::index_cache::ChunkIndexCache;
 use crate::sources::dataset_root::{DatasetRoot, DetectedSource, SplitFolder};
 use crate::sources::kind::SourceKind;
 use crate::sources::options::SourceOptions;
@@ -24,8 +24,8 @@ use crate::sources::test_scenes::{KEPT_AND_ABSENT, TestScenes};
 /// Image folders of DL3DV scenes, by preference: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
 
-/// Smallest number of chunks with a cached census; fewer are read in a second.
-const MIN_CENSUS_CHUNKS: usize = 100;
+/// Smallest number of chunks with a chunk index cache; fewer are read in a second.
+const MIN_CACHED_CHUNKS: usize = 100;
 
 /// An open data set.
 pub struct OpenedSource {
@@ -60,6 +60,20 @@ impl OpenedSource {
 /// [`DataError::UnknownLayout`] for a folder without scenes, [`DataError::BadConfig`] for [`SourceKind::Synthetic`],
 /// and the errors of the reader of the layout.
 pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) -> Result<OpenedSource, DataError> {
+    scan_source(root, split, options, &mut |_, _| ())
+}
+
+/// Opens a data set as [`open_source`] does. `progress` is called while its chunks are examined for the filters: the first
+/// opening of a large data set reads every chunk and can take minutes.
+///
+/// # Errors
+/// As [`open_source`].
+pub(crate) fn scan_source(
+    root: &DatasetRoot,
+    split: Split,
+    options: &SourceOptions,
+    progress: ScanProgress<'_>,
+) -> Result<OpenedSource, DataError> {
     if options.kind == SourceKind::Synthetic {
         return Err(DataError::bad_config("source", "is synthetic; use the layout of the folder, or auto"));
     }
@@ -69,7 +83,7 @@ pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) ->
     let folder = SplitFolder::find(root, split)?;
     let list = list.as_ref();
     let (kind, (source, report)) = match folder.detect(options.kind)? {
-        DetectedSource::Torch(kind) => (kind, folder.open_torch(kind, options, list)?),
+        DetectedSource::Torch(kind) => (kind, folder.open_torch(kind, options, list, progress)?),
         DetectedSource::Photos(kind, scenes, report) => {
             (kind, folder.open_photos(kind, scenes, report, options, list)?)
         }
@@ -86,6 +100,7 @@ impl SplitFolder<'_> {
         kind: SourceKind,
         options: &SourceOptions,
         list: Option<&TestScenes>,
+        progress: ScanProgress<'_>,
     ) -> Result<Opened, DataError> {
         let mut report = SkipReport::default();
         let index = if kind == SourceKind::Chunks {
@@ -101,10 +116,11 @@ impl SplitFolder<'_> {
             keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
         let is_kept = |key: &str| kept.contains(key);
         let num_chunks = index.values().collect::<HashSet<_>>().len();
-        let caches = cache_folder().filter(|_| num_chunks >= MIN_CENSUS_CHUNKS);
-        let census = caches.map(|caches| Census::path(&caches, &self.base));
+        let caches = cache_folder().filter(|_| num_chunks >= MIN_CACHED_CHUNKS);
+        let cache = caches.map(|caches| ChunkIndexCache::path(&caches, &self.base));
+        let cache = cache.as_deref().map(|path| (path, progress));
         let (filters, reads_all) = (&options.filters, options.reads_chunks);
-        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, filters, reads_all, census.as_deref())?;
+        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, filters, reads_all, cache)?;
         if kind == SourceKind::Chunks {
             source.record_unlisted(&self.base, &index);
         }

@@ -36,7 +36,6 @@ pub enum Look {
 pub struct SyntheticConfig {
     /// Kind of scenes: `"rooms"`, or `"real"`, which has the statistics of photos and samples all that the keys from
     /// `fov_deg` on set for rooms.
-    #[serde(skip_serializing_if = "is_rooms")]
     pub look: Look,
     /// Seed of all scenes. Different seeds share no scene.
     pub seed: u64,
@@ -92,12 +91,6 @@ impl Default for SyntheticConfig {
             samples_per_pixel: 4,
         }
     }
-}
-
-/// Returns whether serde skips the key: settings files from before it then compare equal.
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
-fn is_rooms(look: &Look) -> bool {
-    *look == Look::Rooms
 }
 
 impl SyntheticConfig {

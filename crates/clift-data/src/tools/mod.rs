@@ -1,7 +1,7 @@
 //! The operations of `clift data`: info, check, convert, index, synth.
 //!
 //! - `info`: counts and sizes of a source
-//! - `index_census`: statistics of an evaluation index
+//! - `index_statistics`: statistics of an evaluation index
 //! - `overlap_index`: make an evaluation index
 //! - `export`: write a source as chunks
 //! - `convert`: convert any layout, resumable
@@ -14,6 +14,6 @@ pub(crate) mod checksums;
 pub(crate) mod convert;
 pub(crate) mod export;
 pub(crate) mod features;
-pub(crate) mod index_census;
+pub(crate) mod index_statistics;
 pub(crate) mod info;
 pub(crate) mod overlap_index;

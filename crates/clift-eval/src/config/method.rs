@@ -1,14 +1,13 @@
 //! Rendering methods: own methods, two baselines, and external methods by name.
 
-use std::collections::BTreeSet;
-use std::sync::Mutex;
-
 use clift_model::Grouping;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::EvalError;
 
 const MAX_NAME: usize = 40;
+/// Most bytes of a character in UTF-8.
+const MAX_CHAR_BYTES: usize = 4;
 
 /// A method that makes images of target views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, strum::IntoStaticStr)]
@@ -20,10 +19,8 @@ pub enum Method {
     /// Centroid tokens of K-means clusters, without condenser.
     Kmeans,
     /// Centre tokens of rectangular tiles of the context views, without condenser.
-    #[serde(alias = "patch")]
     Tile,
     /// Condensed tiles, with a condenser trained on tiles.
-    #[serde(alias = "patch_clift")]
     TileClift,
     /// A random subset of all tokens.
     Random,
@@ -52,10 +49,10 @@ impl Method {
     ];
 
     /// Returns the name in files and tables.
-    pub fn name(self) -> &'static str {
+    pub fn name(&self) -> &str {
         match self {
             Self::External(name) => name.as_str(),
-            own => own.into(),
+            own => (*own).into(),
         }
     }
 
@@ -82,10 +79,13 @@ impl Method {
     }
 }
 
-/// Name of an external method. The few names live until the process ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(transparent)]
-pub struct MethodName(&'static str);
+/// Name of an external method, in place: a [`Method`] is copied as often as a number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct MethodName {
+    /// UTF-8, followed by zeros.
+    bytes: [u8; MAX_NAME * MAX_CHAR_BYTES],
+    num_bytes: usize,
+}
 
 impl MethodName {
     /// Checks a name: 1 to 40 printable characters, not the name of an own method.
@@ -93,7 +93,6 @@ impl MethodName {
     /// # Errors
     /// [`EvalError::BadMethodName`].
     pub fn new(name: &str) -> Result<Self, EvalError> {
-        static NAMES: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
         let bad = |reason: &str| EvalError::BadMethodName { name: name.into(), reason: reason.into() };
         if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {
             return Err(bad("use 1 to 40 printable characters"));
@@ -101,22 +100,23 @@ impl MethodName {
         if Method::OWN.iter().any(|own| own.name() == name) {
             return Err(bad("reserved for a method of clift; choose another name"));
         }
-        let mut names = NAMES.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if let Some(known) = names.get(name) {
-            return Ok(Self(known));
-        }
-        let kept: &'static str = Box::leak(name.to_owned().into_boxed_str());
-        names.insert(kept);
-        Ok(Self(kept))
+        let mut bytes = [0; MAX_NAME * MAX_CHAR_BYTES];
+        bytes[..name.len()].copy_from_slice(name.as_bytes());
+        Ok(Self { bytes, num_bytes: name.len() })
     }
 
     /// Returns the name.
-    pub const fn as_str(self) -> &'static str {
-        self.0
+    pub fn as_str(&self) -> &str {
+        str::from_utf8(&self.bytes[..self.num_bytes]).unwrap_or_default()
     }
 }
 
-// The derived implementation would only read text of static lifetime.
+impl Serialize for MethodName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.as_str())
+    }
+}
+
 impl<'de> Deserialize<'de> for MethodName {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         Self::new(&String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
@@ -133,7 +133,9 @@ mod tests {
             assert!(MethodName::new(name).is_err(), "{name:?}");
         }
         let name = MethodName::new("LVSM (2 views)").unwrap();
-        assert_eq!(name, MethodName::new(&String::from("LVSM (2 views)")).unwrap());
+        assert_eq!(name, MethodName::new("LVSM (2 views)").unwrap());
+        assert!(MethodName::new("LVSM").unwrap() < name);
+        assert_eq!(MethodName::new(&"\u{1f600}".repeat(40)).unwrap().as_str().chars().count(), 40);
         assert_eq!(name.as_str(), "LVSM (2 views)");
     }
 
@@ -144,10 +146,7 @@ mod tests {
             assert_eq!(serde_json::to_value(method).unwrap(), method.name());
             assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
         }
-        assert_eq!(Method::OWN.map(Method::name)[3..7], ["tile_clift", "random", "lvsm_ed", "nearest_view"]);
+        assert_eq!(Method::OWN.each_ref().map(Method::name)[3..7], ["tile_clift", "random", "lvsm_ed", "nearest_view"]);
         assert!(serde_json::from_value::<Method>("".into()).is_err());
-        // Of former evaluations.
-        let former = ["patch", "patch_clift"].map(|name| serde_json::from_value::<Method>(name.into()).unwrap());
-        assert_eq!(former, [Method::Tile, Method::TileClift]);
     }
 }

@@ -261,7 +261,7 @@ impl Evaluator {
             let frame = item.views.target.first()?;
             Some(image_name(self.reader.source.key(item.scene), *frame))
         });
-        let (name, first, path) = (external.name.as_str(), first.unwrap_or_default(), external.folder.clone());
+        let (name, first, path) = (external.name.as_str().into(), first.unwrap_or_default(), external.folder.clone());
         Err(EvalError::NoPredictions { name, expected: summary.num_views, first, path })
     }
 

@@ -76,7 +76,7 @@ fn image_rows(figure: &SceneFigure) -> io::Result<Markup> {
                 (row(name.as_str(), rendering(other, "its image")?))
             }
         }
-        (strip(&format!("{}, some tokens", best.map_or("", Method::name)), &some.collect::<Vec<_>>())?)
+        (strip(&format!("{}, some tokens", best.as_ref().map_or("", Method::name)), &some.collect::<Vec<_>>())?)
     })
 }
 

@@ -16,7 +16,6 @@ const METRICS: [&str; 3] = ["psnr", "ssim", "lpips_vgg"];
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct RowKey {
     /// Name of the method.
-    #[serde(rename = "variant")]
     pub method: String,
     /// Tokens in the scene file.
     pub num_storage_tokens: usize,
@@ -31,14 +30,12 @@ pub struct RowKey {
 struct Row {
     scene: String,
     target_frame: usize,
-    #[serde(rename = "variant")]
     method: String,
     num_storage_tokens: usize,
     num_render_tokens: usize,
     psnr: Option<f64>,
     ssim: Option<f64>,
     lpips_vgg: Option<f64>,
-    #[serde(default)]
     tokens: String,
 }
 
@@ -68,14 +65,8 @@ impl Evaluation {
         let mut views: BTreeMap<RowKey, BTreeMap<View, Values>> = BTreeMap::new();
         for row in csv::Reader::from_path(&file).map_err(bad)?.deserialize() {
             let row: Row = row.map_err(bad)?;
-            // Former names.
-            let method = match row.method.as_str() {
-                "patch" => "tile".into(),
-                "patch_clift" => "tile_clift".into(),
-                _ => row.method,
-            };
             let key = RowKey {
-                method,
+                method: row.method,
                 num_storage_tokens: row.num_storage_tokens,
                 num_render_tokens: row.num_render_tokens,
                 tokens: row.tokens,

@@ -11,7 +11,7 @@ use crate::statistics::view_metrics::ViewMetrics;
 const VIEW_COLUMNS: [&str; 11] = [
     "scene",
     "target_frame",
-    "variant",
+    "method",
     "num_storage_tokens",
     "num_render_tokens",
     "psnr",
@@ -23,7 +23,7 @@ const VIEW_COLUMNS: [&str; 11] = [
 ];
 
 const SCENE_COLUMNS: [&str; 9] =
-    ["scene", "variant", "num_storage_tokens", "num_render_tokens", "tokens", "num_views", "psnr", "ssim", "lpips_vgg"];
+    ["scene", "method", "num_storage_tokens", "num_render_tokens", "tokens", "num_views", "psnr", "ssim", "lpips_vgg"];
 
 /// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
 pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
@@ -106,14 +106,14 @@ mod tests {
             ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.5, None)),
         ];
         let views = "\
-scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens
+scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens
 attic,2,clift,64,32,23,0.5,0.75,0.25,,f16
 attic,9,clift,64,32,20,0.5,0.25,0.25,,f16
 \"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.25,,f16
 attic,9,nearest_view,0,0,18.5,,,,,
 ";
         let scenes = "\
-scene,variant,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg
+scene,method,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg
 attic,clift,64,32,f16,2,21.5,0.5,0.5
 \"room, \"\"big\"\"\",clift,64,32,f16,1,100,0.5,
 attic,nearest_view,0,0,,1,18.5,,

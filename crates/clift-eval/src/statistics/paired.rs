@@ -27,7 +27,6 @@ const ORDERINGS: [[Method; 2]; 6] = [
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PairedDifference {
     /// The method that the paper finds better.
-    #[serde(rename = "variant")]
     pub method: Method,
     /// The other method.
     pub against: Method,

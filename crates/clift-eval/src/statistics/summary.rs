@@ -28,7 +28,6 @@ pub struct Quality {
     /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
     /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
-    #[serde(default)]
     pub num_identical_views: usize,
 }
 
@@ -78,7 +77,6 @@ pub struct SummaryPoint {
     /// 95th percentile of the time per frame, in seconds.
     pub frame_p95_s: Option<f64>,
     /// Quartiles of the time per frame, in seconds: half of the frames take between the two.
-    #[serde(default)]
     pub frame_quartiles_s: Option<[f64; 2]>,
     /// Multiply-accumulates, bytes and memory.
     #[serde(flatten)]
@@ -94,12 +92,10 @@ pub struct SummaryPoint {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MissingImages {
     /// The external method.
-    #[serde(rename = "variant")]
     pub method: Method,
     /// Number of target views without image.
     pub num_missing: usize,
     /// Paths of the missing images in the folder of the method.
-    #[serde(rename = "pictures")]
     pub images: Vec<String>,
 }
 
@@ -112,11 +108,9 @@ pub struct Summary {
     pub num_views: usize,
     /// Skipped scenes; `skipped.json` has the reasons.
     pub num_skipped: usize,
-    /// What was measured on; `null` in files of earlier versions.
-    #[serde(default)]
+    /// What was measured on.
     pub split: Option<EvalSplit>,
     /// Target views that are also contexts: the input holds their images.
-    #[serde(default)]
     pub num_context_targets: usize,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
@@ -348,7 +342,7 @@ mod tests {
                 "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "num_identical_views": 0}
             },
             "points": [{
-                "variant": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
+                "method": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
                 "num_views": 1, "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
                 "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
                 "render_s": null, "render_median_s": null, "render_p95_s": null,
@@ -360,10 +354,6 @@ mod tests {
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), summary);
-        // Files of earlier versions have one more key.
-        let mut former = expected;
-        former["adaptive"] = serde_json::json!([]);
-        assert_eq!(serde_json::from_value::<Summary>(former).unwrap(), summary);
     }
 
     #[test]

@@ -12,7 +12,6 @@ use crate::config::method::Method;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct EvalKey {
     /// The method.
-    #[serde(rename = "variant")]
     pub method: Method,
     /// Tokens in the scene file; 0 for a baseline.
     pub num_storage_tokens: usize,
@@ -96,7 +95,6 @@ pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
     /// Values of the stored tokens: tokens times their width.
-    #[serde(default)]
     pub scene_values: Option<u64>,
     /// Mean bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,

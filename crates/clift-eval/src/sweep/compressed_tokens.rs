@@ -35,7 +35,7 @@ impl<'a> CompressedTokens<'a> {
         coding: TokenCoding,
         (clip, model_path): (&Clip, &str),
     ) -> Result<Self, EvalError> {
-        let model = models.for_method(method).ok_or(EvalError::NoModel { method: method.name() })?;
+        let model = models.for_method(method).ok_or_else(|| EvalError::NoModel { method: method.name().into() })?;
         let Some(grouping) = method.grouping() else {
             let ids =
                 random_subset(lift.dims()[1], clusters.num_clusters, item_rng(clusters.seed, 0, 0, 0, "random subset"));
@@ -56,7 +56,8 @@ impl<'a> CompressedTokens<'a> {
                 (rounded(tokens, format)?, bytes)
             }
             TokenCoding::Coded(loss) => {
-                let codec = models.codec.as_ref().ok_or(EvalError::NoModel { method: "coded tokens" })?;
+                let codec =
+                    models.codec.as_ref().ok_or_else(|| EvalError::NoModel { method: "coded tokens".into() })?;
                 let share = num_tokens as f64 / lift.dims()[1] as f64;
                 let step = codec.rates.step_for_loss(share, loss.db()) as f32;
                 let scene = scene_of(clip, codec, &ids, host_values(&tokens)?, model_path);

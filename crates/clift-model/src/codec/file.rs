@@ -21,8 +21,7 @@ use crate::weights::file::sorted_header;
 use crate::weights::tensors::Tensors;
 
 const FORMAT: &str = "clift-codec";
-/// Without and with prediction.
-const VERSIONS: [&str; 2] = ["1", "2"];
+const VERSION: &str = "2";
 /// Largest accepted file: a codec of width 4,096 takes a tenth of it.
 const MAX_FILE_BYTES: u64 = 1 << 30;
 
@@ -106,7 +105,7 @@ fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
     let (counts, steps) = (rates.shares.len(), rates.steps.len());
     let f32s = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
     let f64s = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
-    let mut tensors = vec![
+    let tensors = [
         ("mean", Dtype::F32, vec![dim], f32s(&transform.mean)),
         ("basis", Dtype::F32, vec![dim, dim], f32s(&transform.basis)),
         ("deviations", Dtype::F32, vec![dim], f32s(&transform.deviations)),
@@ -117,19 +116,16 @@ fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
         ("rate_bits", Dtype::F64, vec![counts, steps], f64s(&rates.bits)),
         ("rate_loss", Dtype::F64, vec![counts, steps], f64s(&rates.loss)),
         ("rate_psnr", Dtype::F64, vec![counts], f64s(&rates.psnr)),
+        ("weights", Dtype::F32, vec![NUM_CLASSES, dim, 2], f32s(&prediction.weights)),
+        ("scales", Dtype::F32, vec![NUM_CLASSES, dim], f32s(&prediction.scales)),
     ];
-    let has_prediction = *prediction != Prediction::none(dim);
-    if has_prediction {
-        tensors.push(("weights", Dtype::F32, vec![NUM_CLASSES, dim, 2], f32s(&prediction.weights)));
-        tensors.push(("scales", Dtype::F32, vec![NUM_CLASSES, dim], f32s(&prediction.scales)));
-    }
     let views: Result<Vec<_>, _> = tensors
         .iter()
         .map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)))
         .collect();
     let metadata = HashMap::from([
         ("format".to_owned(), FORMAT.to_owned()),
-        ("version".to_owned(), VERSIONS[usize::from(has_prediction)].to_owned()),
+        ("version".to_owned(), VERSION.to_owned()),
         ("kind".to_owned(), kind.name().to_owned()),
         ("model".to_owned(), serde_json::to_string(model).map_err(|error| error.to_string())?),
         ("renderer".to_owned(), renderer_hash.clone()),
@@ -148,8 +144,8 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     if format != FORMAT {
         return Err(format!("format {format:?}, expected {FORMAT:?}"));
     }
-    if !VERSIONS.contains(&version.as_str()) {
-        return Err(format!("version {version:?}, expected {}", VERSIONS.join(" or ")));
+    if version != VERSION {
+        return Err(format!("version {version}, this clift reads version {VERSION}; fit it again with `clift codec`"));
     }
     let model: ModelConfig =
         serde_json::from_str(field("model")?).map_err(|error| format!("unreadable `model` ({error})"))?;
@@ -174,13 +170,8 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     };
     let distributions =
         Distributions { knots: f32s("knots", &[knots])?, cumulative: f32s("cumulative", &[dim, knots])? };
-    let prediction = match version.as_str() {
-        "1" => Prediction::none(dim),
-        _ => Prediction {
-            weights: f32s("weights", &[NUM_CLASSES, dim, 2])?,
-            scales: f32s("scales", &[NUM_CLASSES, dim])?,
-        },
-    };
+    let prediction =
+        Prediction { weights: f32s("weights", &[NUM_CLASSES, dim, 2])?, scales: f32s("scales", &[NUM_CLASSES, dim])? };
     if let Some(scale) = prediction.scales.iter().find(|scale| **scale <= 0.0) {
         return Err(format!("scale {scale}, expected a positive number"));
     }

@@ -106,8 +106,8 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// Expects every coefficient at the mean, as codecs of version 1.
-    pub fn none(dim: usize) -> Self {
+    /// Expects every coefficient at the mean.
+    pub(crate) fn none(dim: usize) -> Self {
         Self { weights: vec![0.0; NUM_CLASSES * dim * 2], scales: vec![1.0; NUM_CLASSES * dim] }
     }
 

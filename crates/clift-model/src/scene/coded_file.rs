@@ -14,7 +14,7 @@
 //!
 //! `__metadata__` holds strings: `format` = `clift-scene`, `version` = `5`, `key`, `codec` (hash of the model's codec),
 //! `model_path`, `views` (number, height and width, as `4x64x64`) and `tokens` (their number). Everything else is in the
-//! codec, see [`TokenCodec`]. Version 3 has other views, versions 3 and 4 another normalization. `docs/reference/files.md` describes how tokens are decoded.
+//! codec, see [`TokenCodec`]. `docs/reference/files.md` describes how tokens are decoded.
 // N patches of the context views, S tokens, V context views
 
 use std::fmt::Write as _;
@@ -115,11 +115,10 @@ pub(crate) fn from_coded_bytes(
         return Err(refusal(reason, GIVE_MODEL));
     }
     let ([views, height, width], num_tokens) = (fields.views()?, fields.count("tokens")?);
-    let version = fields.get("version")?;
     let split = || {
         let (step, rest) = body[..body.len().saturating_sub(4)].split_first_chunk::<4>()?;
-        let (world, rest) = read_world(version, rest)?;
-        let (views, words) = read_views(version, views, rest)?;
+        let (world, rest) = read_world(rest)?;
+        let (views, words) = read_views(views, rest)?;
         (words.len() % 4 == 0).then_some((f32::from_le_bytes(*step), world, views, words))
     };
     let Some((step, world, (context, context_frames), words)) = split() else {

@@ -3,15 +3,11 @@
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
-use crate::scene::scene::{CODED_VERSION, FORMER_CODED_VERSIONS, SceneNormalization};
+use crate::scene::scene::SceneNormalization;
 use crate::views::camera::ViewCamera;
 
 /// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
 const WORLD_BYTES: usize = 4 * 4 + 4 * 8;
-/// Bytes of the normalization before version 5: three rows of the pose and the scale in f64.
-const FORMER_WORLD_BYTES: usize = 13 * 8;
-/// Bytes of a view in version 3: three rows of the pose, `fx, fy, cx, cy`, and the frame number.
-const FORMER_VIEW_BYTES: usize = 17 * 4;
 /// Bytes of a view: rotation, center and frame number.
 const VIEW_BYTES: usize = 8 * 4;
 const INTRINSICS_BYTES: usize = 4 * 4;
@@ -24,13 +20,8 @@ pub(crate) fn write_world(world: &SceneNormalization, body: &mut Vec<u8>) {
     body.extend([x, y, z, world.scale].into_iter().flat_map(f64::to_le_bytes));
 }
 
-/// Reads the normalization of a file of this version; returns it and the rest of the bytes. `None` if there are too few bytes.
-pub(crate) fn read_world<'a>(version: &str, bytes: &'a [u8]) -> Option<(SceneNormalization, &'a [u8])> {
-    if version != CODED_VERSION {
-        let (bytes, rest) = bytes.split_at_checked(FORMER_WORLD_BYTES)?;
-        let [.., scale] = doubles::<13>(bytes);
-        return Some((SceneNormalization { mean_c2w: from_rows(&doubles::<12>(bytes)), scale }, rest));
-    }
+/// Reads the normalization; returns it and the rest of the bytes. `None` if there are too few bytes.
+pub(crate) fn read_world(bytes: &[u8]) -> Option<(SceneNormalization, &[u8])> {
     let (bytes, rest) = bytes.split_at_checked(WORLD_BYTES)?;
     let [x, y, z, scale] = doubles(&bytes[16..]);
     Some((SceneNormalization { mean_c2w: pose(floats(bytes), [x, y, z]), scale }, rest))
@@ -52,13 +43,8 @@ pub(crate) fn write_views(context: &[ViewCamera], frames: &[u32], body: &mut Vec
 /// Cameras and frame numbers.
 type Views = (Vec<ViewCamera>, Vec<u32>);
 
-/// Reads `views` views of a file of this version; returns cameras, frame numbers and the rest of the bytes. `None` if there
-/// are too few bytes.
-pub(crate) fn read_views<'a>(version: &str, views: usize, bytes: &'a [u8]) -> Option<(Views, &'a [u8])> {
-    if version == FORMER_CODED_VERSIONS[0] {
-        let (bytes, rest) = bytes.split_at_checked(views.checked_mul(FORMER_VIEW_BYTES)?)?;
-        return Some((bytes.chunks_exact(FORMER_VIEW_BYTES).map(former_view).unzip(), rest));
-    }
+/// Reads `views` views; returns cameras, frame numbers and the rest of the bytes. `None` if there are too few bytes.
+pub(crate) fn read_views(views: usize, bytes: &[u8]) -> Option<(Views, &[u8])> {
     let (count, bytes) = bytes.split_first_chunk::<4>()?;
     let count = u32::from_le_bytes(*count) as usize;
     if count != 1 && count != views {
@@ -69,18 +55,10 @@ pub(crate) fn read_views<'a>(version: &str, views: usize, bytes: &'a [u8]) -> Op
     let (bytes, rest) = bytes.split_at_checked(views.checked_mul(VIEW_BYTES)?)?;
     let view = |(i, bytes): (usize, &[u8])| {
         let c2w = pose(floats(bytes), floats(&bytes[16..]));
-        (ViewCamera { c2w, intrinsics: intrinsics[i.min(count - 1)] }, frame(bytes))
+        let frame = u32::from_le_bytes(bytes[VIEW_BYTES - 4..].try_into().expect("the last 4 bytes of a view"));
+        (ViewCamera { c2w, intrinsics: intrinsics[i.min(count - 1)] }, frame)
     };
     Some((bytes.chunks_exact(VIEW_BYTES).enumerate().map(view).unzip(), rest))
-}
-
-fn former_view(bytes: &[u8]) -> (ViewCamera, u32) {
-    (ViewCamera { c2w: from_rows(&floats(bytes)), intrinsics: floats(&bytes[48..]) }, frame(bytes))
-}
-
-/// Returns the pose of three rows.
-fn from_rows(rows: &[f64; 12]) -> [f64; 16] {
-    std::array::from_fn(|i| if i == 15 { 1.0 } else { rows.get(i).copied().unwrap_or(0.0) })
 }
 
 /// Returns the pose of a quaternion and a center. That of damaged numbers contains NaN, which the check of the scene finds.
@@ -108,9 +86,4 @@ fn doubles<const N: usize>(bytes: &[u8]) -> [f64; N] {
 fn floats<const N: usize>(bytes: &[u8]) -> [f64; N] {
     let values = bytes.as_chunks::<4>().0;
     std::array::from_fn(|i| f64::from(f32::from_le_bytes(values[i])))
-}
-
-/// Returns the frame number, which is the last of a view.
-fn frame(view: &[u8]) -> u32 {
-    view.last_chunk::<4>().map_or(0, |bytes| u32::from_le_bytes(*bytes))
 }

@@ -35,12 +35,9 @@ impl Fields {
         value.parse().map_err(|_| format!("{name} {value:?}, expected a number"))
     }
 
-    /// Returns number, height and width of the context views of a coded file. Versions 3 and 4 have a field for each.
+    /// Returns number, height and width of the context views of a coded file.
     pub fn views(&self) -> Result<[usize; 3], String> {
         let value = self.get("views")?;
-        if self.0.contains_key("height") {
-            return Ok([self.count("views")?, self.count("height")?, self.count("width")?]);
-        }
         let sizes: Result<Vec<usize>, _> = value.split('x').map(str::parse).collect();
         let sizes = sizes.ok().and_then(|sizes| sizes.try_into().ok());
         sizes.ok_or_else(|| format!("views {value:?}, expected number x height x width, as \"4x64x64\""))

@@ -21,15 +21,13 @@ impl Scene {
         path.unwrap_or_else(|| model.into()).to_string_lossy().into_owned()
     }
 
-    /// Returns the path of the model of the scene that was read from `file`: beside the file, else in the current folder, as in
-    /// files of earlier versions. The path need not exist.
+    /// Returns the path of the model of the scene that was read from `file`. A relative model path starts at the folder of
+    /// the file. The path need not exist.
     pub fn find_model(&self, file: &Path) -> PathBuf {
         find_model(&self.model_path, file)
     }
 }
 
 pub(crate) fn find_model(model_path: &str, file: &Path) -> PathBuf {
-    let beside = folder_of(file).join(model_path);
-    let here = PathBuf::from(model_path);
-    if !beside.exists() && here.exists() { here } else { beside }
+    folder_of(file).join(model_path)
 }

@@ -11,9 +11,7 @@ use crate::network::config::ModelConfig;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
-use crate::scene::scene::{
-    CODED_VERSION, FORMAT, FORMER_CODED_VERSIONS, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name,
-};
+use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, SceneNormalization, VERSION, dtype_name};
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
 use crate::views::camera::ViewCamera;
@@ -28,7 +26,8 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 const RAY_TOLERANCE: f64 = 1e-4;
 
 const GIVE_ANOTHER: &str = "give a file that `clift encode` wrote";
-const OTHER_VERSION: &str = "use the version of clift that wrote it, or encode the scene again";
+const OTHER_VERSION: &str = "encode the scene again, or render it with the clift that wrote it, for versions 1, 3 and 4 \
+                             commit da4454f8 or earlier";
 
 impl Scene {
     /// Reads and checks a scene file. Coded tokens need the codec of the scene's model, see [`find_model`](Self::find_model).
@@ -93,12 +92,13 @@ fn from_bytes(
         return Err(refusal("the file is no scene: its header lacks the scene format", GIVE_ANOTHER));
     }
     let version = fields.get("version")?;
-    if version == CODED_VERSION || FORMER_CODED_VERSIONS.contains(&version) {
+    if version == CODED_VERSION {
         let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
         return from_coded_bytes(bytes, body, &fields, find_codec);
     }
-    if ![VERSION, FORMER_VERSION].contains(&version) {
-        let reason = format!("scene file version {version:?}, expected \"1\" to {CODED_VERSION:?}");
+    if version != VERSION {
+        let reason =
+            format!("scene file of version {version}, this clift reads versions {VERSION} and {CODED_VERSION}");
         return Err(refusal(reason, OTHER_VERSION));
     }
     let kind = fields.get("kind")?;

@@ -33,12 +33,8 @@ pub const HEADER_BYTES: usize = 2048;
 pub(crate) const FORMAT: &str = "clift-scene";
 /// The version of files with plain tokens.
 pub(crate) const VERSION: &str = "2";
-/// Files like version 2, whose renderer hash does not include the number of heads.
-pub(crate) const FORMER_VERSION: &str = "1";
 /// The version of files with coded tokens.
 pub(crate) const CODED_VERSION: &str = "5";
-/// Files with coded tokens whose normalization has a matrix, in version 3 the views too.
-pub(crate) const FORMER_CODED_VERSIONS: [&str; 2] = ["3", "4"];
 
 /// Normalization of camera positions: `R^T (c - t) * scale`, where `[R | t]` is the mean pose.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -20,8 +20,7 @@ use crate::views::camera::ViewCamera;
 use crate::views::interleave::{interleaved, parts};
 use crate::views::patch_grids::PatchGrids;
 use crate::views::upload::Cameras;
-use crate::weights::hash::{renderer_hash, weights_hash};
-use crate::weights::model_path::check_sizes;
+use crate::weights::hash::renderer_hash;
 use crate::weights::trained_model::open_renderer;
 
 /// Most frames of one call with all tokens, where frames share keys and values.
@@ -51,11 +50,7 @@ pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [heigh
 pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let renderer = open_renderer(&scene.model, weights, device)?;
     let got = renderer_hash(&renderer, &scene.model);
-    let is_former = got != scene.renderer_hash && weights_hash(&renderer) == scene.renderer_hash;
-    if is_former {
-        // The hash of a scene file of version 1 does not include the heads.
-        weights.ancestors().skip(1).take(2).try_for_each(|dir| check_sizes(&scene.model, dir))?;
-    } else if got != scene.renderer_hash {
+    if got != scene.renderer_hash {
         return Err(ModelError::OtherRenderer { expected: scene.renderer_hash.clone(), got, path: weights.into() });
     }
     Ok(renderer)

@@ -4,7 +4,6 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
-use crate::network::architecture::CameraEncoding;
 use crate::network::config::ModelConfig;
 use crate::network::renderer::Renderer;
 
@@ -26,10 +25,7 @@ pub fn weights_hash<M: Module>(module: &M) -> String {
 /// shapes do not determine.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, camera_encoding, .. } = config;
-    // Renderers of former versions keep their hashes.
-    let is_plain = *camera_encoding == CameraEncoding::Plucker;
-    let encoding = if is_plain { String::new() } else { format!("{camera_encoding} ") };
-    hex::encode(Sha256::digest(format!("{variant} {num_heads} {encoding}{}", weights_hash(renderer))))
+    hex::encode(Sha256::digest(format!("{variant} {num_heads} {camera_encoding} {}", weights_hash(renderer))))
 }
 
 /// Calls `f` with path, shape and values of every parameter, in the module's order.

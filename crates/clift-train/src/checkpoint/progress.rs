@@ -13,11 +13,10 @@ use serde_json::Value;
 use crate::error::TrainError;
 use crate::step::loss_scale::LossScale;
 use crate::step::step_guard::LossHistory;
+use crate::version::check_version;
 
 pub(crate) const STATE: &str = "state.json";
 pub(crate) const VERSION: u32 = 3;
-/// Version with the numbers of [`Progress`] as strings.
-const STRING_VERSION: u32 = 2;
 
 /// Content of `state.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -27,11 +26,9 @@ pub(crate) struct State {
     pub progress: Progress,
     /// Checksums of the other files, by name.
     pub files: BTreeMap<String, Fingerprint>,
-    /// Config of the network; absent in the oldest files.
-    #[serde(default)]
+    /// Config of the network; `None` for checkpoints that were opened without one.
     pub model: Option<ModelConfig>,
     /// Loss scale of training with f16 products.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub loss_scale: Option<LossScale>,
 }
 
@@ -78,7 +75,7 @@ fn null_as_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
 }
 
 impl State {
-    /// Reads `state.json` of a checkpoint, also of version 2.
+    /// Reads `state.json` of a checkpoint.
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join(STATE);
         let text = std::fs::read(&path).map_err(TrainError::io("reading a checkpoint", &path))?;
@@ -86,35 +83,15 @@ impl State {
     }
 
     fn parse(text: &[u8]) -> Result<Self, String> {
-        let mut value: Value = serde_json::from_slice(text).map_err(|error| error.to_string())?;
-        let version = &value["version"];
-        if *version == STRING_VERSION {
-            parse_numbers(&mut value["progress"]);
-        } else if *version != VERSION {
-            return Err(format!("version {version}, this program reads {STRING_VERSION} and {VERSION}"));
-        }
-        let state: Self = serde_json::from_value(value).map_err(|error| error.to_string())?;
-        Ok(Self { version: VERSION, ..state })
+        let value: Value = serde_json::from_slice(text).map_err(|error| error.to_string())?;
+        check_version(&value, VERSION)?;
+        serde_json::from_value(value).map_err(|error| error.to_string())
     }
 
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
         let path = folder.join(STATE);
         let text = serde_json::to_vec(self).map_err(TrainError::bad_file("checkpoint", &path))?;
         replace_file(&path, &text).map_err(TrainError::io("writing a checkpoint", &path))
-    }
-}
-
-/// Replaces every string that is a number by the number, as of version 3.
-fn parse_numbers(value: &mut Value) {
-    match value {
-        Value::String(text) => {
-            if let Ok(number) = text.parse::<f64>() {
-                *value = number.into();
-            }
-        }
-        Value::Array(items) => items.iter_mut().for_each(parse_numbers),
-        Value::Object(entries) => entries.values_mut().for_each(parse_numbers),
-        Value::Null | Value::Bool(_) | Value::Number(_) => {}
     }
 }
 
@@ -176,25 +153,9 @@ mod tests {
     }
 
     #[test]
-    fn version_2_with_numbers_as_strings_is_read() {
-        let values = [0.1, 1.0 / 3.0, 5e-324];
-        let version_2 = |psnr: &str| {
-            let lists = ["losses", "grad_norms"].map(|name| {
-                let sign = if name == "losses" { 1.0 } else { -1.0 };
-                format!("\"{name}\":[{}]", values.map(|value| format!("\"{}\"", sign * value)).join(","))
-            });
-            format!(
-                "{{\"version\":2,\"progress\":{{\"step\":7,\"bad_steps\":0,\"num_bad_steps\":0,\"validated\":0,\
-                 \"best\":{{\"step\":5,\"psnr\":\"{psnr}\"}},\"recent\":{{{}}}}},\"files\":{{}},\"model\":null}}",
-                lists.join(",")
-            )
-        };
-        let read = State::parse(version_2("24.309").as_bytes()).unwrap();
-        assert_eq!(read, state(&values, 24.309));
-        assert!(State::parse(version_2("NaN").as_bytes()).unwrap().progress.best.unwrap().psnr.is_nan());
-        assert!(State::parse(version_2("one").as_bytes()).is_err());
-        let message = State::parse(br#"{"version":4}"#).unwrap_err();
-        assert_eq!(message, "version 4, this program reads 2 and 3");
+    fn files_of_other_versions_are_refused() {
+        let message = State::parse(br#"{"version":2}"#).unwrap_err();
+        assert_eq!(message, "version 2, this clift reads version 3; the clift that wrote the file reads it");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use clift_data::{ClipReader, DataError, ViewIndices};
 use clift_eval::upload_views;
 use clift_model::{Encoder, SceneClusters};
 
-use crate::cluster_cache::cache::{ClusterCache, VERSION, settings};
+use crate::cluster_cache::cache::{CacheSettings, ClusterCache, VERSION};
 use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
 use crate::config::config::{ClustersConfig, Config};
 use crate::distributed::ranks::Ranks;
@@ -44,7 +44,8 @@ impl ClusterBuilder<'_> {
         // Rank 0 alone writes.
         let mut log = None;
         let done = ranks.from_root(|| {
-            let cache_key = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
+            let cache_key =
+                CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: CacheSettings::new(config) };
             let opened = ResumeLog::open(&folder.with_extension("tmp"), cache_key)?;
             Ok(log.insert(opened).num_sets())
         })?;

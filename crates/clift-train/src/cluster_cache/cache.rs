@@ -7,14 +7,18 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use clift_data::SkipReport;
-use clift_model::{Grouping, SceneClusters};
+use clift_data::{
+    Crop, FileOptions, PoseRotation, PoseScale, SceneFilters, SkipReport, SourceKind, SyntheticConfig, ViewSampler,
+};
+use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
-use crate::config::config::{Config, MAX_TOKENS};
+use crate::config::config::{ClustersConfig, Config, MAX_TOKENS};
 use crate::error::TrainError;
+use crate::version::check_version;
 
-pub(crate) const VERSION: u32 = 1;
+pub(crate) const VERSION: u32 = 2;
 
 /// One clustered context set of a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -37,10 +41,50 @@ pub(crate) struct CacheIndex {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
-    /// Settings that determine the clusters, as JSON in a string, compared as text.
-    pub settings: String,
+    pub settings: CacheSettings,
     pub skipped: SkipReport,
     pub entries: Vec<CacheEntry>,
+}
+
+/// Settings that determine the clusters, besides the encoder.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct CacheSettings {
+    seed: u64,
+    source: SourceKind,
+    root: Option<PathBuf>,
+    files: FileOptions,
+    synthetic: SyntheticConfig,
+    width: usize,
+    height: usize,
+    pose_rotation: PoseRotation,
+    pose_scale: PoseScale,
+    crop: Crop,
+    filters: SceneFilters,
+    views: ViewSampler,
+    clusters: ClustersConfig,
+}
+
+impl CacheSettings {
+    /// Returns the settings of a config.
+    pub fn new(config: &Config) -> Self {
+        let data = config.data.clone();
+        Self {
+            seed: config.seed,
+            source: data.source,
+            root: data.root,
+            files: data.files,
+            synthetic: data.synthetic,
+            width: data.width,
+            height: data.height,
+            pose_rotation: data.pose_rotation,
+            pose_scale: data.pose_scale,
+            crop: data.crop,
+            filters: data.filters,
+            views: data.views,
+            clusters: config.clusters.clone(),
+        }
+    }
 }
 
 impl CacheEntry {
@@ -71,22 +115,20 @@ impl ClusterCache {
     pub fn open(folder: &Path, config: &Config, encoder: &str) -> Result<Self, TrainError> {
         let path = folder.join("index.json");
         let text = std::fs::read(&path).map_err(TrainError::io("reading the cluster cache", &path))?;
-        let index: CacheIndex = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
+        let index: Value = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
         let stale = |reason: String| TrainError::StaleClusters { reason, path: folder.into() };
-        if index.version != VERSION {
-            return Err(stale(format!("version {}, this program writes {VERSION}", index.version)));
-        }
+        check_version(&index, VERSION).map_err(stale)?;
+        let index: CacheIndex = serde_json::from_value(index).map_err(TrainError::bad_file("cluster cache", &path))?;
         if index.encoder != encoder {
             let short = |hash: &str| hash.chars().take(12).collect::<String>();
             let reason =
                 format!("its tokens are of encoder {}, the run's is {}", short(&index.encoder), short(encoder));
             return Err(stale(reason));
         }
-        let wanted = settings(config);
+        let wanted = CacheSettings::new(config);
         if index.settings != wanted {
-            let values = [&index.settings, &wanted].map(|text| serde_json::from_str(text).unwrap_or_default());
-            let key = first_difference(&values).unwrap_or_default();
-            return Err(stale(format!("{key} differs from that of this run")));
+            let key = first_difference(&[&index.settings, &wanted].map(|settings| serde_json::json!(settings)));
+            return Err(stale(format!("{} differs from that of this run", key.unwrap_or_default())));
         }
         if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
             let CacheEntry { key, num_tokens, num_storage_tokens, .. } = entry;
@@ -133,32 +175,9 @@ impl ClusterCache {
     }
 }
 
-pub(crate) fn settings(config: &Config) -> String {
-    let data = &config.data;
-    let mut clusters = serde_json::json!(config.clusters);
-    if config.clusters.grouping == Grouping::Tile {
-        // The former name, which existing caches have.
-        clusters["grouping"] = "patch".into();
-    }
-    serde_json::json!({
-        "seed": config.seed,
-        "source": data.source,
-        "root": data.root,
-        "files": data.files,
-        "synthetic": data.synthetic,
-        "size": [data.width, data.height],
-        "poses": [serde_json::json!(data.pose_rotation), serde_json::json!(data.pose_scale)],
-        "exact_principal_point": data.clip_options().exact_principal_point,
-        "filters": data.filters,
-        "views": data.views,
-        "clusters": clusters,
-    })
-    .to_string()
-}
-
 /// Returns the first key, by path, with two values.
-fn first_difference(values: &[serde_json::Value; 2]) -> Option<String> {
-    let [Some(one), Some(other)] = values.each_ref().map(serde_json::Value::as_object) else { return None };
+fn first_difference(values: &[Value; 2]) -> Option<String> {
+    let [Some(one), Some(other)] = values.each_ref().map(Value::as_object) else { return None };
     let key = one.keys().chain(other.keys()).find(|key| one.get(*key) != other.get(*key))?;
     let below = [one, other].map(|object| object.get(key).cloned().unwrap_or_default());
     Some(first_difference(&below).map_or_else(|| key.clone(), |path| format!("{key}.{path}")))
@@ -176,7 +195,7 @@ mod tests {
         let index = CacheIndex {
             version: VERSION,
             encoder: "e".into(),
-            settings: settings(&config),
+            settings: CacheSettings::new(&config),
             skipped: SkipReport::new(1),
             entries: vec![entry],
         };
@@ -198,18 +217,10 @@ mod tests {
     #[test]
     fn the_first_other_setting_is_named() {
         let mut config = Config::default();
-        let before = settings(&config);
+        let before = CacheSettings::new(&config);
         config.clusters.kmeans.max_iterations += 1;
-        let values = [before, settings(&config)].map(|text| serde_json::from_str(&text).expect("JSON"));
+        let values = [before, CacheSettings::new(&config)].map(|settings| serde_json::json!(settings));
         assert_eq!(first_difference(&values).as_deref(), Some("clusters.kmeans.max_iterations"));
         assert_eq!(first_difference(&[values[0].clone(), values[0].clone()]), None);
-    }
-
-    #[test]
-    fn settings_of_tiles_keep_the_former_name() {
-        let mut config = Config::default();
-        assert!(settings(&config).contains("\"grouping\":\"kmeans\""));
-        config.clusters.grouping = Grouping::Tile;
-        assert!(settings(&config).contains("\"grouping\":\"patch\""));
     }
 }

@@ -13,7 +13,7 @@ use clift_data::SkipReport;
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
-use crate::cluster_cache::cache::{CacheEntry, CacheIndex};
+use crate::cluster_cache::cache::{CacheEntry, CacheIndex, CacheSettings};
 use crate::config::config::MAX_TOKENS;
 use crate::error::TrainError;
 
@@ -22,13 +22,13 @@ const DATA: &str = "clusters.bin";
 const JOURNAL: &str = "journal.jsonl";
 
 /// Inputs of a cache build. A build resumes only if they are equal. First line of the log.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CacheKey {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
-    pub settings: String,
+    pub settings: CacheSettings,
 }
 
 /// A further line: the outcome of a context set.
@@ -221,9 +221,10 @@ mod tests {
     use rand::RngExt;
 
     use super::*;
+    use crate::config::config::Config;
 
     fn cache_key() -> CacheKey {
-        CacheKey { version: 1, encoder: "abc".into(), settings: "{}".into() }
+        CacheKey { version: 1, encoder: "abc".into(), settings: CacheSettings::new(&Config::default()) }
     }
 
     fn new_build() -> (tempfile::TempDir, PathBuf) {

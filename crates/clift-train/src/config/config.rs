@@ -329,8 +329,6 @@ impl Default for CheckpointConfig {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::Crop;
-
     use super::*;
 
     #[test]
@@ -379,21 +377,5 @@ mod tests {
         config.stage1.optimizer.betas = [0.9, 1.0];
         let message = config.validate().unwrap_err().to_string();
         assert!(message.starts_with("`stage1.optimizer.betas` = [0.9, 1.0]: write two numbers"), "{message}");
-    }
-
-    #[test]
-    fn newer_keys_are_not_written_by_default() {
-        let written = |config: &Config| toml::Table::try_from(config).unwrap()["data"].clone();
-        let mut config = Config::default();
-        let data = written(&config);
-        assert!(["crop", "flip"].iter().all(|key| data.get(key).is_none()) && data["views"].get("inner").is_none());
-        assert!(!config.data.clip_options().exact_principal_point);
-        (config.data.crop, config.data.flip) = (Crop::Exact, true);
-        let data = written(&config);
-        assert_eq!((data["crop"].as_str(), data["flip"].as_bool()), (Some("exact"), Some(true)));
-        assert!(config.data.clip_options().exact_principal_point);
-        config.data.crop = Crop::Protocol;
-        config.data.exact_principal_point = true;
-        assert!(config.data.clip_options().exact_principal_point);
     }
 }

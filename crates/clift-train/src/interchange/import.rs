@@ -11,7 +11,7 @@ use crate::error::{TrainError, bad};
 use crate::interchange::keys::{Keys, printable};
 use crate::interchange::model_dir::{self, HostTensor};
 use crate::interchange::problems;
-use crate::interchange::record::{ImportOptions, ImportRecord, check_stop};
+use crate::interchange::record::{ImportOptions, ImportRecord, VERSION, check_stop};
 
 /// Reads a checkpoint and writes a model directory, completely or not at all.
 ///
@@ -60,7 +60,7 @@ pub fn import(
         mapping.push((key.clone(), tensor.parts.iter().map(|(path, _)| path.clone()).collect()));
     }
     let imported = ImportRecord {
-        version: 1,
+        version: VERSION,
         file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         sha256: hash_file(file)?,
         variant: options.variant,

@@ -6,8 +6,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clift_model::{CliftVariant, PROJECTIONS};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use crate::error::TrainError;
+use crate::version::check_version;
+
+pub(crate) const VERSION: u32 = 1;
 
 /// Options of an import.
 #[derive(Clone, Debug)]
@@ -44,7 +48,6 @@ pub struct ImportRecord {
     /// First parts of keys that are known not to belong to the network, with their numbers.
     pub ignored: BTreeMap<String, usize>,
     /// Patterns of unknown keys outside the network, with their numbers.
-    #[serde(default)]
     pub outside: BTreeMap<String, usize>,
     /// Python classes and functions whose objects were skipped.
     pub passed_over: BTreeSet<String>,
@@ -65,7 +68,9 @@ impl ImportRecord {
             return Ok(None);
         }
         let text = std::fs::read(&path).map_err(TrainError::io("reading what was imported", &path))?;
-        let imported: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("import.json", &path))?;
+        let imported: Value = serde_json::from_slice(&text).map_err(TrainError::bad_file("import.json", &path))?;
+        check_version(&imported, VERSION).map_err(TrainError::bad_file("import.json", &path))?;
+        let imported: Self = serde_json::from_value(imported).map_err(TrainError::bad_file("import.json", &path))?;
         if let Some(layer) = imported.convolutions.iter().find(|layer| !PROJECTIONS.contains(&layer.as_str())) {
             return Err(TrainError::bad_file("import.json", &path)(format!("unknown projection {layer:?}")));
         }

@@ -60,7 +60,7 @@ pub fn evaluate_model(
     let split = request.split;
     // No frame of this data set is held out of the training of a foreign model.
     config.data.hold_out = 0;
-    let opened = open_dataset(&config.data, split)?;
+    let opened = open_dataset(&config.data, split, &mut |done, total| sink.event(&Event::Scan { done, total }))?;
     sink.event(&Event::Message(format!("{split}: {}", opened.report)));
     let frames = EvalFrames::new(&opened, split, 0, false);
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };

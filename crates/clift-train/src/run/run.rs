@@ -95,11 +95,10 @@ impl Run {
             return Err(bad("eval.lpips_weights", path.display(), &fix));
         }
         let mut lock = None;
-        // Rank 0 alone writes, and decides which frames the run holds out.
-        config.data.hold_out = ranks.from_root(|| {
-            let (opened, hold_out) = open_folder(config.clone(), options, sink)?;
-            lock = Some(opened);
-            Ok(hold_out)
+        // Rank 0 alone writes.
+        ranks.from_root(|| {
+            lock = Some(open_folder(&config, options, sink)?);
+            Ok(())
         })?;
         let text = toml::to_string(&config).map_err(TrainError::bad_file("config", &config.run_dir))?;
         ranks.require_same("the configs", &text)?;
@@ -148,7 +147,8 @@ impl Run {
             std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
         }
         self.report_opening(Split::Train, sink);
-        let opened = open_training_dataset(&self.config.data, self.config.last_gap_step())?;
+        let mut progress = |done, total| sink.event(&Event::Scan { done, total });
+        let opened = open_training_dataset(&self.config.data, self.config.last_gap_step(), &mut progress)?;
         let is_divided = opened.kind != SourceKind::Synthetic && !opened.shares_scenes && self.overfit.is_none();
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
@@ -243,10 +243,12 @@ impl Run {
         }
         self.report_opening(split, sink);
         let data = &self.config.data;
+        let mut progress = |done, total| sink.event(&Event::Scan { done, total });
         let (opened, split, frames) = if self.overfit.is_some() {
-            (open_training_dataset(data, self.config.stage1.steps)?, Split::Train, EvalFrames::whole(EvalSplit::Train))
+            let opened = open_training_dataset(data, self.config.stage1.steps, &mut progress)?;
+            (opened, Split::Train, EvalFrames::whole(EvalSplit::Train))
         } else {
-            let opened = open_dataset(data, split)?;
+            let opened = open_dataset(data, split, &mut progress)?;
             let frames = EvalFrames::new(&opened, split, data.hold_out, self.is_training_data);
             (opened, split, frames)
         };

@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 
 use clift_core::{make_folder, remove_leftovers, replace_file};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use crate::config::config::Config;
-use crate::config::parse::parse_config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::run::extend::{ExtensionRecord, StepExtension};
 use crate::run::lock::{LockedFolder, RunLock};
-use crate::run::training_data::TrainingData;
+use crate::version::check_version;
 
 const FILE: &str = "run.json";
 const VERSION: u32 = 1;
@@ -41,7 +41,6 @@ pub(crate) struct RunFile {
     /// Number of scenes of `--overfit`.
     pub overfit: Option<usize>,
     /// Extensions by `--extend`, in order.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub extended: Vec<ExtensionRecord>,
 }
 
@@ -53,12 +52,9 @@ impl RunFile {
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join(FILE);
         let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
-        let run: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", &path))?;
-        if run.version != VERSION {
-            let reason = format!("it has version {}, this program reads {VERSION}", run.version);
-            return Err(TrainError::bad_file("run file", &path)(reason));
-        }
-        Ok(run)
+        let run: Value = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", &path))?;
+        check_version(&run, VERSION).map_err(TrainError::bad_file("run file", &path))?;
+        serde_json::from_value(run).map_err(TrainError::bad_file("run file", &path))
     }
 
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
@@ -84,16 +80,11 @@ pub struct RunOptions {
 /// Parts of a run with a folder.
 const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
 
-/// Locks the run directory of a config, new or existing, and writes the resolved config to it. Returns the lock, and the
-/// `data.hold_out` of the run.
+/// Locks the run directory of a config, new or existing, and writes the resolved config to it. Returns the lock.
 ///
 /// # Errors
 /// [`TrainError::OtherRun`], [`TrainError::Locked`] and [`TrainError::Io`].
-pub(crate) fn open_folder(
-    mut config: Config,
-    options: &RunOptions,
-    sink: &mut dyn Sink,
-) -> Result<(RunLock, usize), TrainError> {
+pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<RunLock, TrainError> {
     let folder = &config.run_dir;
     if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
         return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
@@ -118,20 +109,15 @@ pub(crate) fn open_folder(
     }
     if has_begun {
         let found = RunFile::read(folder)?;
-        if !TrainingData::read(&config.run_dir)?.has_key {
-            // A run from before the key resumes with the frames that it was started with.
-            config.data.hold_out = 0;
-        }
-        let folder = &config.run_dir;
-        let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
+        let extensions = compare_settings(folder, &found, config, options.overfit, options.extend)?;
         file.extended = found.extended;
         for extension in extensions {
-            file.extended.push(extension.apply(&config, sink)?);
+            file.extended.push(extension.apply(config, sink)?);
         }
     }
     file.write(folder)?;
-    write_config(&config)?;
-    Ok((lock, config.data.hold_out))
+    write_config(config)?;
+    Ok(lock)
 }
 
 /// Checks that a run directory is still at its path: a process that has it open must not make a second one there.
@@ -163,14 +149,8 @@ fn compare_settings(
     let path = folder.join("config.toml");
     let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the run's config", &path))?;
     let bad = || TrainError::bad_file("config", &path);
-    // Keys that an older version did not write have their defaults; keys unknown to this version are differences.
-    let old = match parse_config::<Config>(&path, &text, &[]) {
-        Ok((mut old, _)) => {
-            old.data.hold_out = TrainingData::read(folder)?.hold_out;
-            toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?
-        }
-        Err(_) => text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?,
-    };
+    let old: Config = toml::from_str(&text).map_err(|error| bad()(error.message().to_owned()))?;
+    let old = toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?;
     let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;
     let (mut old, mut new) = (flatten(old), flatten(new));
     let flag = |overfit: Option<usize>| overfit.map_or("off".into(), |count| count.to_string());
@@ -247,31 +227,6 @@ mod tests {
 
     fn old() -> Config {
         Config { run_dir: "run".into(), ..Config::default() }
-    }
-
-    #[test]
-    fn missing_keys_have_defaults_and_unknown_ones_differ() {
-        let text = toml::to_string_pretty(&old()).unwrap();
-        let shorter: String =
-            text.lines().filter(|line| !line.starts_with("spike_factor")).collect::<Vec<_>>().join("\n");
-        assert!(shorter.len() < text.len());
-        assert!(differ(&shorter, &old(), false).unwrap().is_empty());
-        let mut other = old();
-        other.stage2.optimizer.spike_factor = 7.0;
-        let message = differ(&shorter, &other, false).unwrap_err().to_string();
-        assert!(message.contains("  stage2.optimizer.spike_factor: 100.0 -> 7.0\n"), "{message}");
-        let message = differ(&format!("wings = 2\n{text}"), &old(), false).unwrap_err().to_string();
-        assert!(message.contains("  wings: 2 -> not set\n"), "{message}");
-    }
-
-    #[test]
-    fn run_with_former_names_is_resumed() {
-        let mut tiles = old();
-        tiles.clusters.grouping = clift_model::Grouping::Tile;
-        let text = toml::to_string_pretty(&tiles).unwrap();
-        let former = text.replace("activation_checkpointing", "recompute").replace("\"tile\"", "\"patch\"");
-        assert!(former.contains("recompute = false") && former.contains("grouping = \"patch\""));
-        assert!(differ(&former, &tiles, false).unwrap().is_empty());
     }
 
     #[test]

@@ -2,34 +2,32 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::Deserialize;
+
 use crate::config::config::Config;
 use crate::error::TrainError;
 
-/// Data keys in the `config.toml` of a run.
+/// The `[data]` section of a run, as far as it says which frames were trained on.
+#[derive(Deserialize)]
 pub(crate) struct TrainingData {
     root: Option<PathBuf>,
-    /// The `data.hold_out` that the run was trained with: 0 for a run from before the key.
     pub hold_out: usize,
-    /// Whether the file has `data.hold_out`.
-    pub has_key: bool,
 }
 
 impl TrainingData {
-    /// Reads the keys of the run in `folder`.
+    /// Reads the section of the run in `folder`.
     ///
     /// # Errors
     /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
+        #[derive(Deserialize)]
+        struct Sections {
+            data: TrainingData,
+        }
         let path = folder.join("config.toml");
         let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the run's config", &path))?;
-        let table: toml::Table = text.parse().map_err(TrainError::bad_file("config", &path))?;
-        let key = |name: &str| table.get("data").and_then(|data| data.get(name));
-        let hold_out = key("hold_out").and_then(toml::Value::as_integer);
-        Ok(Self {
-            root: key("root").and_then(toml::Value::as_str).map(PathBuf::from),
-            hold_out: hold_out.and_then(|every| usize::try_from(every).ok()).unwrap_or_default(),
-            has_key: hold_out.is_some(),
-        })
+        let sections: Sections = toml::from_str(&text).map_err(TrainError::bad_file("config", &path))?;
+        Ok(sections.data)
     }
 
     /// Returns whether `config` may read frames that the run was trained on: from the same folder, from one inside the other,
@@ -46,13 +44,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn runs_before_the_key_held_out_no_frame() {
+    fn data_inside_the_folder_of_the_training_is_training_data() {
         let folder = tempfile::tempdir().unwrap();
         let read = |text: &str| {
             std::fs::write(folder.path().join("config.toml"), text).unwrap();
             TrainingData::read(folder.path()).unwrap()
         };
-        assert_eq!(read("[data]\nwidth = 8").hold_out, 0);
         let root = folder.path().display().to_string();
         let data = read(&format!("[data]\nhold_out = 4\nroot = '{root}'"));
         let mut config = Config::default();
@@ -63,7 +60,7 @@ mod tests {
         std::fs::create_dir(&inner).unwrap();
         config.data.root = Some(inner.clone());
         assert!(data.is_of(&config), "a part of it");
-        let data = read(&format!("[data]\nroot = '{}'", inner.display()));
+        let data = read(&format!("[data]\nhold_out = 0\nroot = '{}'", inner.display()));
         config.data.root = Some(other.clone());
         std::fs::create_dir(&other).unwrap();
         assert!(!data.is_of(&config));

@@ -12,7 +12,7 @@ use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::usage_bail;
 use crate::interrupt;
-use crate::output::bar::progress_sink;
+use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 

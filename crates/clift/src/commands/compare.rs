@@ -22,7 +22,7 @@ pub struct CompareArgs {
     /// Second evaluation
     pub b: PathBuf,
     /// Compare method A of the first with method B of the second, at equal counts
-    #[arg(long, alias = "variants", value_name = "A,B", value_parser = parse_methods)]
+    #[arg(long, value_name = "A,B", value_parser = parse_methods)]
     pub methods: Option<[MethodFilter; 2]>,
     #[command(flatten)]
     pub json: JsonArg,

@@ -12,7 +12,7 @@ use crate::commands::args::parse::{parse_bytes, parse_split};
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
-use crate::output::bar::progress_sink;
+use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::{print_evaluation, print_warning};
 
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
@@ -144,7 +144,7 @@ pub struct EvalArgs {
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
     /// Select rendered tokens by this rule: paper, global, scaled or random
-    #[arg(long, alias = "select", value_name = "PRESET")]
+    #[arg(long, value_name = "PRESET")]
     pub selection: Option<Selection>,
     /// Storage of the tokens: f32, f16, int8, coded, or coded-DB, e.g. f16,coded-0.1
     #[arg(long, value_delimiter = ',', value_name = "FORMAT")]

@@ -24,8 +24,6 @@ const VALIDATION_KEYS: [&str; 3] = ["psnr", "ssim", "num_views"];
 struct Line {
     stage: Stage,
     step: u64,
-    /// Missing in runs of earlier versions.
-    #[serde(default)]
     time: f64,
     /// `null` for values that are not finite.
     #[serde(flatten)]
@@ -68,7 +66,7 @@ fn read_rows(run: &Path) -> anyhow::Result<Rows> {
     let mut rows = Rows::new();
     for (name, is_step) in [("metrics.jsonl", true), ("validation.jsonl", false)] {
         let path = run.join(name);
-        // Runs of earlier versions, and those without validation, lack the second.
+        // Runs without validation lack the second.
         if !is_step && !path.exists() {
             continue;
         }

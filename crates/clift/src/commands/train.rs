@@ -10,7 +10,7 @@ use crate::commands::args::parse::{parse_count, parse_stage};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::ranks::{connect, finish};
 use crate::interrupt;
-use crate::output::bar::progress_sink;
+use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::{print_run, print_warning};
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {

@@ -1,33 +1,14 @@
 //! A progress bar on a terminal.
 
-use std::io::IsTerminal;
 use std::time::Duration;
 
 use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use crate::output::event_line::{event_line, step_metrics, time_left};
-use crate::output::plain::{INTERVAL_S, PlainLines};
-use crate::output::stdout::{print_note, print_warning};
+use crate::output::stdout::print_note;
 use crate::output::units::rate;
-use crate::output::verbosity::Verbosity;
 use crate::output::visible::visible;
-
-/// Creates a progress bar if the standard error is a terminal, progress lines otherwise; warnings alone for `--quiet`, and
-/// a line for every step for `--verbose`.
-pub fn progress_sink() -> Box<dyn Sink> {
-    match Verbosity::chosen() {
-        Verbosity::Silent => Box::new(|_: &Event| {}),
-        Verbosity::Quiet => Box::new(|event: &Event| {
-            if let Event::Warning(text) = event {
-                print_warning(text);
-            }
-        }),
-        Verbosity::Verbose => Box::new(PlainLines::new(std::io::stderr(), 0.0)),
-        Verbosity::Normal if std::io::stderr().is_terminal() => Box::new(Bar::default()),
-        Verbosity::Normal => Box::new(PlainLines::new(std::io::stderr(), INTERVAL_S)),
-    }
-}
 
 /// A progress bar per stage, with the lines of other events above the bar.
 #[derive(Default)]

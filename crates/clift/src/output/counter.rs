@@ -1,7 +1,6 @@
 //! Progress of counted work outside training.
 
 use std::io::IsTerminal;
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
@@ -59,20 +58,26 @@ impl Drop for Counter {
     }
 }
 
-/// Shows how many chunks of a data set are examined, if that takes longer than half a second, as it does the first time.
-pub fn count_chunks(done: usize, total: usize) {
-    static COUNTER: Mutex<Option<(Instant, Option<Counter>)>> = Mutex::new(None);
-    let mut counter = COUNTER.lock().unwrap_or_else(PoisonError::into_inner);
-    let (started, shown) = counter.get_or_insert_with(|| (Instant::now(), None));
-    if started.elapsed() > CHUNKS_DELAY {
-        shown.get_or_insert_with(|| Counter::new("chunks", total as u64)).set(done as u64);
-    }
-    if done == total {
-        *counter = None;
+/// A counter of the examined chunks of a data set, shown if the scan takes longer than half a second, as the first one does.
+#[derive(Default)]
+pub struct ScanCounter {
+    /// Start of the scan, and the counter once it is shown.
+    scan: Option<(Instant, Option<Counter>)>,
+}
+
+impl ScanCounter {
+    pub fn set(&mut self, done: usize, total: usize) {
+        let (started, shown) = self.scan.get_or_insert_with(|| (Instant::now(), None));
+        if started.elapsed() > SCAN_DELAY {
+            shown.get_or_insert_with(|| Counter::new("chunks", total as u64)).set(done as u64);
+        }
+        if done == total {
+            self.scan = None;
+        }
     }
 }
 
-const CHUNKS_DELAY: Duration = Duration::from_millis(500);
+const SCAN_DELAY: Duration = Duration::from_millis(500);
 
 fn line(name: &str, done: u64, total: u64, elapsed_s: f64) -> String {
     let per_s = done.max(1) as f64 / elapsed_s.max(1e-9);

@@ -21,7 +21,7 @@ pub(crate) fn event_line(event: &Event) -> Option<String> {
         Stage::Eval => "scenes",
     };
     Some(match event {
-        Event::Step(_) | Event::Progress { .. } => return None,
+        Event::Scan { .. } | Event::Step(_) | Event::Progress { .. } => return None,
         Event::StageStarted { stage, done: 0, num_steps } => format!("{}: {num_steps} {}", stage.name(), unit(*stage)),
         Event::StageStarted { stage, done, num_steps } => {
             format!("{}: resumed after {done} of {num_steps} {}", stage.name(), unit(*stage))

@@ -9,14 +9,16 @@
 //! - `stdout`: results to stdout, notes to stderr
 //! - `event_line`: an event as one line
 //! - `plain`: progress lines for log files
-//! - `bar`: progress bar, or lines
+//! - `bar`: progress bar
 //! - `counter`: progress of counted work
+//! - `progress_sink`: bar, lines or nothing, by verbosity
 
 pub(crate) mod bar;
 pub(crate) mod counter;
 pub(crate) mod event_line;
 pub(crate) mod json;
 pub(crate) mod plain;
+pub(crate) mod progress_sink;
 pub(crate) mod stdout;
 pub(crate) mod table;
 pub(crate) mod tensorboard;

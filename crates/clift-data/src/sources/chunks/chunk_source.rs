@@ -12,18 +12,24 @@ use crate::error::DataError;
 use crate::image::codec::decode_image;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on};
-use crate::sources::chunks::census::{Census, ChunkCensus, Progress, SceneCensus};
 use crate::sources::chunks::index::read_index;
+use crate::sources::chunks::index_cache::{CachedChunk, CachedScene, ChunkIndexCache};
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::{DL3DV_PREFIX, find_by_name};
+
+/// Chunks that are examined between two calls of the progress callback.
+const CHUNKS_PER_CALL: usize = 64;
+
+/// Progress callback: number of examined chunks, and of all.
+pub type ScanProgress<'a> = &'a mut dyn FnMut(usize, usize);
 
 /// A chunk file, whose table is read on the first use of one of its scenes.
 struct Chunk {
     path: PathBuf,
     table: OnceLock<ChunkTable>,
-    /// Counts of a cached or new census.
-    census: Option<ChunkCensus>,
+    /// The entry in the chunk index cache, if the cache is used.
+    cached: Option<CachedChunk>,
 }
 
 impl Chunk {
@@ -38,18 +44,18 @@ impl Chunk {
         Ok(())
     }
 
-    /// Returns the cached census if it is current, and otherwise reads the table and makes one.
-    fn examine(&self, cached: Option<&ChunkCensus>, needs_fov: bool) -> Result<ChunkCensus, DataError> {
+    /// Returns the cached entry if it is current, and otherwise reads the table and makes one.
+    fn examine(&self, cached: Option<&CachedChunk>, needs_fov: bool) -> Result<CachedChunk, DataError> {
         match cached {
-            Some(census) if census.is_current(&self.path, needs_fov) => Ok(census.clone()),
-            _ => ChunkCensus::of(&self.path, || self.table(), needs_fov),
+            Some(cached) if cached.is_current(&self.path, needs_fov) => Ok(cached.clone()),
+            _ => CachedChunk::of(&self.path, || self.table(), needs_fov),
         }
     }
 
     /// Returns the keys of all scenes of the file, as far as they are in memory.
     fn keys(&self) -> Vec<&String> {
-        match (&self.census, self.table.get()) {
-            (Some(census), _) => census.scenes.keys().collect(),
+        match (&self.cached, self.table.get()) {
+            (Some(cached), _) => cached.scenes.keys().collect(),
             (None, Some(table)) => table.scenes.keys().collect(),
             (None, None) => Vec::new(),
         }
@@ -99,14 +105,15 @@ impl ChunkSource {
     }
 
     /// Opens the scenes of `index`, a map from keys to files in `folder`, for which `kept` is true. With `reads_all`, the
-    /// table of every chunk is read even without filters. The file `census` caches what the filters depend on.
+    /// table of every chunk is read even without filters. `cache` is the path of the chunk index cache, with the progress
+    /// callback of the scan that fills it.
     pub(crate) fn of_index(
         folder: &Path,
         index: &BTreeMap<String, String>,
         kept: impl Fn(&str) -> bool,
         filters: &SceneFilters,
         reads_all: bool,
-        census: Option<&Path>,
+        cache: Option<(&Path, ScanProgress<'_>)>,
     ) -> Result<Self, DataError> {
         filters.validate()?;
         let mut chunk_ids = BTreeMap::new();
@@ -114,14 +121,14 @@ impl ChunkSource {
         let mut scenes = Vec::with_capacity(index.len());
         for (key, file) in index.iter().filter(|(key, _)| kept(key)) {
             let chunk = *chunk_ids.entry(file).or_insert_with_key(|file| {
-                chunks.push(Chunk { path: folder.join(file), table: OnceLock::new(), census: None });
+                chunks.push(Chunk { path: folder.join(file), table: OnceLock::new(), cached: None });
                 chunks.len() - 1
             });
             scenes.push(Entry { key: key.clone(), chunk });
         }
         let mut source = Self { chunks, report: SkipReport::new(scenes.len()), scenes, positions: HashMap::new() };
-        if let Some(path) = census.filter(|_| filters.is_any_set() && !reads_all) {
-            source.take_census(path, filters.max_fov_deg.is_some());
+        if let Some((path, progress)) = cache.filter(|_| filters.is_any_set() && !reads_all) {
+            source.scan(path, filters.max_fov_deg.is_some(), progress);
         }
         source.skip_scenes(filters, reads_all || filters.is_any_set())?;
         source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
@@ -138,36 +145,37 @@ impl ChunkSource {
         span.read(path)
     }
 
-    /// Counts the scenes of all readable chunks, of unchanged ones from the file at `path`, and updates the file.
-    fn take_census(&mut self, path: &Path, needs_fov: bool) {
+    /// Examines all readable chunks, unchanged ones in the chunk index cache at `path`, and updates the cache.
+    fn scan(&mut self, path: &Path, needs_fov: bool, progress: ScanProgress<'_>) {
         let name = |chunk: &Chunk| chunk.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let cached = Census::read(path).chunks;
-        let progress = Progress::of(self.chunks.len());
-        let examine = |chunk: &mut Chunk| {
-            chunk.census = chunk.examine(cached.get(&name(chunk)), needs_fov).ok();
-            progress.advance();
-        };
-        self.chunks.par_iter_mut().for_each(examine);
-        let chunks = self.chunks.iter().filter_map(|chunk| Some((name(chunk), chunk.census.clone()?)));
+        let cached = ChunkIndexCache::read(path).chunks;
+        let examine = |chunk: &mut Chunk| chunk.cached = chunk.examine(cached.get(&name(chunk)), needs_fov).ok();
+        let (mut done, total) = (0, self.chunks.len());
+        for chunks in self.chunks.chunks_mut(CHUNKS_PER_CALL) {
+            chunks.par_iter_mut().for_each(examine);
+            done += chunks.len();
+            progress(done, total);
+        }
+        let chunks = self.chunks.iter().filter_map(|chunk| Some((name(chunk), chunk.cached.clone()?)));
         // The other split may have its chunks in the same folder.
         let mut updated = cached.clone();
         updated.extend(chunks);
         if updated != cached {
-            Census::write(updated, path);
+            ChunkIndexCache::write(updated, path);
         }
     }
 
-    /// Returns the census of a scene.
-    fn census(&self, scene: usize) -> Option<&SceneCensus> {
+    /// Returns the cached values of a scene.
+    fn cached(&self, scene: usize) -> Option<&CachedScene> {
         let Entry { key, chunk } = self.scenes.get(scene)?;
-        self.chunks[*chunk].census.as_ref()?.scenes.get(key)
+        self.chunks[*chunk].cached.as_ref()?.scenes.get(key)
     }
 
     /// Moves the scenes of failing chunks and the filtered scenes to the report.
     fn skip_scenes(&mut self, filters: &SceneFilters, reads_tables: bool) -> Result<(), DataError> {
         let open = |chunk: &Chunk| {
             chunk.find()?;
-            if reads_tables && chunk.census.is_none() { chunk.table().map(|_| ()) } else { Ok(()) }
+            if reads_tables && chunk.cached.is_none() { chunk.table().map(|_| ()) } else { Ok(()) }
         };
         let opened: Vec<Result<(), DataError>> = self.chunks.par_iter().map(open).collect();
         let failures: Vec<_> = opened.iter().map(|opened| opened.as_ref().err().map(ToString::to_string)).collect();
@@ -177,7 +185,7 @@ impl ChunkSource {
         let reason = |scene: usize| {
             let failure = failures[self.scenes[scene].chunk].clone();
             let filter = || {
-                if reads_tables && self.census(scene).is_none() {
+                if reads_tables && self.cached(scene).is_none() {
                     self.table(scene)?;
                 }
                 self.reason_to_skip(scene, filters)
@@ -222,7 +230,7 @@ impl ChunkSource {
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
         let num_frames = if filters.min_frames > 0 { self.num_frames(scene)? } else { 0 };
-        let fov_deg = self.census(scene).and_then(|census| census.fov_deg);
+        let fov_deg = self.cached(scene).and_then(|cached| cached.fov_deg);
         filters.reason_to_skip(num_frames, || fov_deg.map_or_else(|| Ok(widest_fov_deg(&self.cameras(scene)?)), Ok))
     }
 
@@ -260,7 +268,7 @@ impl SceneSource for ChunkSource {
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        self.census(scene).map_or_else(|| Ok(self.table(scene)?.1.images.len()), |census| Ok(census.num_frames))
+        self.cached(scene).map_or_else(|| Ok(self.table(scene)?.1.images.len()), |cached| Ok(cached.num_frames))
     }
 
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {

@@ -1,12 +1,12 @@
 use super::*;
 
 const HEAD: &str =
-    "scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s";
+    "scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens";
 
 fn evaluation(folder: &Path, name: &str, rows: &[&str]) -> Evaluation {
     let path = folder.join(name);
     std::fs::create_dir_all(path.join("eval")).unwrap();
-    let text = format!("{HEAD},tokens\n{}\n", rows.join("\n"));
+    let text = format!("{HEAD}\n{}\n", rows.join("\n"));
     std::fs::write(path.join("eval/views.csv"), text).unwrap();
     Evaluation::read(&path).unwrap()
 }
@@ -53,10 +53,10 @@ fn differences_are_paired_by_view() {
 #[test]
 fn keys_of_one_side_are_named() {
     let folder = tempfile::tempdir().unwrap();
-    let a = evaluation(folder.path(), "a", &["x,1,clift,8,8,20,,,,,f32", "x,1,patch,8,8,19,,,,,f32"]);
+    let a = evaluation(folder.path(), "a", &["x,1,clift,8,8,20,,,,,f32", "x,1,tile,8,8,19,,,,,f32"]);
     let b = evaluation(folder.path(), "b", &["x,1,clift,8,8,20,,,,,f16", "x,1,tile,8,8,19,,,,,f32"]);
     let comparison = Comparison::new(&a, &b, None).unwrap();
-    assert_eq!(comparison.pairs.len(), 1, "a former name is the present one's");
+    assert_eq!(comparison.pairs.len(), 1);
     let text = comparison.to_string();
     assert!(text.contains("Only in A, not compared: clift 8 f32.\nOnly in B, not compared: clift 8 f16.\n"), "{text}");
     let sides = ["clift:f32", "clift:f16"].map(MethodFilter::parse);
@@ -110,9 +110,6 @@ fn incomparable_evaluations_are_errors() {
     let missing = Evaluation::read(&folder.path().join("nowhere")).unwrap_err().to_string();
     assert!(missing.contains("`clift eval` writes the file") && missing.ends_with("nowhere"), "{missing}");
     let bad = folder.path().join("views.csv");
-    std::fs::write(&bad, format!("{HEAD}\nx,1,clift,eight,8,20,,,,\n")).unwrap();
+    std::fs::write(&bad, format!("{HEAD}\nx,1,clift,eight,8,20,,,,,f32\n")).unwrap();
     assert!(Evaluation::read(&bad).is_err());
-    // Files of earlier versions have no column of formats.
-    std::fs::write(&bad, format!("{HEAD}\nx,1,clift,8,8,20,,,,\n")).unwrap();
-    assert!(Evaluation::read(&bad).is_ok());
 }

@@ -187,7 +187,7 @@ fn invalid_headers_are_refused() {
         (
             r#""version":"2""#,
             r#""version":"9""#,
-            r#"file version "9", expected "1" to "5"; use the version of clift that"#,
+            "scene file of version 9, this clift reads versions 2 and 5; encode the scene again, or render it with",
         ),
         (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
         (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number"#),

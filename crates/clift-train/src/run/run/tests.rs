@@ -191,7 +191,7 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
         }
     };
     let run = Run::open(micro(place.path(), &LONG), &RunOptions::default(), &mut sink).expect("valid");
-    let opened = open_training_dataset(&run.config.data, run.config.stage1.steps).expect("rooms");
+    let opened = open_training_dataset(&run.config.data, run.config.stage1.steps, &mut |_, _| ()).expect("rooms");
     let reader = run.reader(opened, Split::Train, &mut sink).expect("readable");
     let whole =
         Config { stage1: Stage1Config { half_resolution: 0.0, ..run.config.stage1.clone() }, ..run.config.clone() };
@@ -242,7 +242,7 @@ fn a_rank_without_data_ends_all_and_rank_0_saves_first() {
         let work = || {
             let mut sink = |_: &Event| {};
             let run = Run::open_on(ranks.clone(), config.clone(), &RunOptions::default(), &mut sink)?;
-            let opened = open_training_dataset(&run.config.data, run.config.stage1.steps)?;
+            let opened = open_training_dataset(&run.config.data, run.config.stage1.steps, &mut |_, _| ())?;
             let reader = run.reader(opened, Split::Train, &mut sink)?;
             let validation = run.validation(Split::Test, &mut sink)?;
             let batches = Stage1Batches::new(&run.config, &reader, run.parts(Stage::Stage1))?;

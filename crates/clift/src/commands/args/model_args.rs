@@ -11,6 +11,7 @@ use clift_train::{Config, Override};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
+use crate::output::counter::ScanCounter;
 use crate::output::stdout::{print_note, print_warning};
 
 /// The model that is used where none is named, trained on synthetic scenes.
@@ -67,7 +68,10 @@ impl ModelArgs {
 
     /// Opens one split of the folder, or of the data of the config.
     pub fn open_data(&self, split: Split) -> anyhow::Result<OpenedSource> {
-        let Some(folder) = &self.folder else { return Ok(open_dataset(&self.config.data, split)?) };
+        let Some(folder) = &self.folder else {
+            let mut counter = ScanCounter::default();
+            return Ok(open_dataset(&self.config.data, split, &mut |done, total| counter.set(done, total))?);
+        };
         // The `data.files` keys of a run describe its own data: they apply only if `--set` sets one of them.
         let has_files = self.overrides.iter().any(|change| change.key.starts_with("data.files"));
         let files = if has_files { self.config.data.files.clone() } else { FileOptions::default() };

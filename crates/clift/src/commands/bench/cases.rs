@@ -90,7 +90,6 @@ pub enum BenchCommand {
     /// Time reading clips from a data set, in order and at random
     Data(BenchDataArgs),
     /// Compare f16 or bf16 with f32 matrix products: time, loss, PSNR, gradient
-    #[command(alias = "half")]
     Precision(BenchPrecisionArgs),
 }
 

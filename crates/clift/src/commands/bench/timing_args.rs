@@ -10,7 +10,7 @@ use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 #[derive(Debug, clap::Args)]
 pub struct TimingArgs {
     /// Time these cases, separated by commas [default: all]
-    #[arg(long = "case", alias = "work", value_delimiter = ',', value_name = "CASE")]
+    #[arg(long = "case", value_delimiter = ',', value_name = "CASE")]
     pub cases: Vec<BenchCase>,
     /// Timed repetitions
     #[arg(long, value_name = "COUNT", default_value = "5", value_parser = parse_count)]

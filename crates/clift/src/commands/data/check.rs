@@ -133,7 +133,7 @@ pub struct CheckArgs {
     #[command(flatten)]
     pub json: JsonArg,
     /// Write an image per scene: two frames with epipolar lines
-    #[arg(long, alias = "pictures", value_name = "OUT")]
+    #[arg(long, value_name = "OUT")]
     pub images: Option<PathBuf>,
 }
 

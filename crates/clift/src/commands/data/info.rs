@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexCensus, OpenedSource, SceneSource, SceneSubset,
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexStatistics, OpenedSource, SceneSource, SceneSubset,
     SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
 use clift_eval::{EvalFrames, evaluation_items};
@@ -16,6 +16,7 @@ use crate::commands::args::shared_args::{JsonArg, read_config};
 use crate::commands::args::splits::{Splits, present_splits, read_all_options};
 use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
 use crate::exit_code::usage_bail;
+use crate::output::counter::ScanCounter;
 use crate::output::stdout::print_result;
 
 /// Most synthetic scenes that are described: a config may have millions of similar ones.
@@ -30,9 +31,9 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let name = args.path.file_name().unwrap_or_default().to_string_lossy();
     let is_scene = is_json && name.starts_with("transforms");
     if is_json && !is_scene {
-        let census = IndexCensus::new(&EvaluationIndex::read(&args.path)?);
-        print_result(&format!("{census}\n"))?;
-        return args.json.write(&census);
+        let statistics = IndexStatistics::new(&EvaluationIndex::read(&args.path)?);
+        print_result(&format!("{statistics}\n"))?;
+        return args.json.write(&statistics);
     }
     let report = if args.path.is_dir() || is_scene {
         if !args.set.is_empty() {
@@ -73,7 +74,9 @@ fn describe_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     let data = &config.data;
     let mut report = Report { path: path.to_owned(), ..Report::default() };
     for split in [Split::Train, Split::Test] {
-        let described = open_dataset(data, split).and_then(|opened| {
+        let mut counter = ScanCounter::default();
+        let opened = open_dataset(data, split, &mut |done, total| counter.set(done, total));
+        let described = opened.and_then(|opened| {
             if split == Split::Test {
                 let frames = EvalFrames::new(&opened, split, data.hold_out, true);
                 report.evaluation = Some(evaluation(config, opened.source.clone(), frames));

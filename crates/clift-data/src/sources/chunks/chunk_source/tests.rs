@@ -1,10 +1,8 @@
 use super::*;
-use crate::sources::chunks::census::observe_census;
 use crate::sources::chunks::writer::{SceneRecord, chunk_bytes, scene_file_bytes, write_chunks};
 use crate::testing::{fixture, re10k_mini};
 use crate::torch::pickle_writer::PickleWriter;
 use safetensors::SafeTensors;
-use std::sync::Mutex;
 
 const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
 
@@ -264,10 +262,10 @@ fn write_made_up(folder: &Path, num_chunks: usize, num_scenes: usize, num_frames
     std::fs::write(folder.join("index.json"), serde_json::to_vec(&index).unwrap()).unwrap();
 }
 
-fn open_with_census(folder: &Path, filters: &SceneFilters) -> ChunkSource {
+fn open_cached(folder: &Path, filters: &SceneFilters, progress: ScanProgress<'_>) -> ChunkSource {
     let index = read_index(&folder.join("index.json")).unwrap();
-    let census = folder.join("cache/census.json");
-    let mut source = ChunkSource::of_index(folder, &index, |_| true, filters, false, Some(&census)).unwrap();
+    let cache = folder.join("cache/chunk-index.json");
+    let mut source = ChunkSource::of_index(folder, &index, |_| true, filters, false, Some((&cache, progress))).unwrap();
     source.record_unlisted(folder, &index);
     source
 }
@@ -279,7 +277,7 @@ fn unchanged_chunks_are_not_read_again() {
     let frames = SceneFilters { min_frames: 9, max_fov_deg: None };
     let tables_read = |source: &ChunkSource| source.chunks.iter().filter(|chunk| chunk.table.get().is_some()).count();
     let opened = |filters: &SceneFilters| {
-        let source = open_with_census(folder.path(), filters);
+        let source = open_cached(folder.path(), filters, &mut |_, _| ());
         let num_frames: usize = (0..source.num_scenes()).map(|scene| source.num_frames(scene).unwrap()).sum();
         (tables_read(&source), num_frames, source.report.to_string())
     };
@@ -308,18 +306,13 @@ fn unchanged_chunks_are_not_read_again() {
 }
 
 #[test]
-fn the_observer_hears_of_every_chunk() {
-    static HEARD: Mutex<Vec<usize>> = Mutex::new(Vec::new());
-    observe_census(|done, total| {
-        // Other tests open other numbers of chunks.
-        if total == 11 {
-            HEARD.lock().unwrap().push(done);
-        }
-    });
+fn progress_counts_every_chunk() {
     let folder = tempfile::tempdir().unwrap();
-    write_made_up(folder.path(), 11, 1, 9);
-    open_with_census(folder.path(), &SceneFilters { min_frames: 9, max_fov_deg: None });
-    assert_eq!(*HEARD.lock().unwrap(), (1..=11).collect::<Vec<_>>());
+    write_made_up(folder.path(), 2 * CHUNKS_PER_CALL + 3, 1, 9);
+    let mut calls = Vec::new();
+    let filters = SceneFilters { min_frames: 9, max_fov_deg: None };
+    open_cached(folder.path(), &filters, &mut |done, total| calls.push((done, total)));
+    assert_eq!(calls, [64, 128, 131].map(|done| (done, 131)));
 }
 
 /// Figures of docs/results/performance.md.
@@ -331,7 +324,7 @@ fn start_up_of_67000_scenes_takes_two_seconds() {
     let filters = SceneFilters { min_frames: 46, max_fov_deg: Some(100.0) };
     let times = [(); 3].map(|()| {
         let started = std::time::Instant::now();
-        let source = open_with_census(folder.path(), &filters);
+        let source = open_cached(folder.path(), &filters, &mut |_, _| ());
         let num_frames: usize = (0..source.num_scenes()).map(|scene| source.num_frames(scene).unwrap()).sum();
         assert_eq!(num_frames, 6_700_000);
         started.elapsed().as_secs_f64()

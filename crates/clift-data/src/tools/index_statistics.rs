@@ -9,7 +9,7 @@ use crate::sampling::evaluation_index::EvaluationIndex;
 
 /// Counts of an [`EvaluationIndex`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct IndexCensus {
+pub struct IndexStatistics {
     /// Number of keys, null and empty entries included.
     pub num_keys: usize,
     /// Number of keys with views.
@@ -26,28 +26,28 @@ pub struct IndexCensus {
     pub num_scenes_with_given: usize,
 }
 
-impl IndexCensus {
+impl IndexStatistics {
     /// Counts the keys and views of `index`.
     pub fn new(index: &EvaluationIndex) -> Self {
-        let mut census = Self { num_keys: index.num_keys(), ..Self::default() };
+        let mut statistics = Self { num_keys: index.num_keys(), ..Self::default() };
         for (_, views) in index.usable() {
             let given = views.num_context_targets();
-            census.num_usable += 1;
-            census.num_targets += views.target.len();
-            census.num_targets_given += given;
-            census.num_scenes_with_given += usize::from(given > 0);
+            statistics.num_usable += 1;
+            statistics.num_targets += views.target.len();
+            statistics.num_targets_given += given;
+            statistics.num_scenes_with_given += usize::from(given > 0);
         }
         let bounds = |count: fn(&ViewIndices) -> usize| {
             let counts = || index.usable().map(|(_, views)| count(views));
             [counts().min().unwrap_or(0), counts().max().unwrap_or(0)]
         };
-        census.num_context = bounds(|views| views.context.len());
-        census.num_targets_per_scene = bounds(|views| views.target.len());
-        census
+        statistics.num_context = bounds(|views| views.context.len());
+        statistics.num_targets_per_scene = bounds(|views| views.target.len());
+        statistics
     }
 }
 
-impl fmt::Display for IndexCensus {
+impl fmt::Display for IndexStatistics {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let range =
             |[least, most]: [usize; 2]| if least == most { least.to_string() } else { format!("{least} to {most}") };
@@ -70,13 +70,13 @@ mod tests {
     use super::*;
     use crate::testing::read_from_file;
 
-    fn census(json: &str) -> IndexCensus {
-        IndexCensus::new(&read_from_file("index.json", json, EvaluationIndex::read).unwrap())
+    fn statistics(json: &str) -> IndexStatistics {
+        IndexStatistics::new(&read_from_file("index.json", json, EvaluationIndex::read).unwrap())
     }
 
     #[test]
     fn views_and_shared_targets_are_counted() {
-        let found = census(
+        let found = statistics(
             r#"{"a": {"context": [0, 9], "target": [0, 9, 4]}, "b": {}, "c": {"context": [1, 2, 3], "target": [2]}}"#,
         );
         assert_eq!((found.num_context, found.num_targets_per_scene), ([2, 3], [1, 3]));
@@ -85,7 +85,7 @@ mod tests {
         assert!(text.contains("2 of 3 keys have views, 1 have none"), "{text}");
         assert!(text.contains("2 to 3 context and 1 to 3 target frames"), "{text}");
         assert!(text.contains("3 targets (75.0 %) of 2 scenes"), "{text}");
-        let none = census(r#"{"a": null}"#);
+        let none = statistics(r#"{"a": null}"#);
         assert_eq!((none.num_keys, none.num_usable), (1, 0));
         assert!(none.to_string().contains("0 targets (0.0 %)"), "{none}");
     }
