@@ -8,17 +8,13 @@ use crate::support::{repository, sources};
 type Crate = (&'static str, &'static str, &'static str);
 
 const CRATES: [Crate; 9] = [
-    ("clift-core", "", "error statistics random rgb_image files geometry"),
+    ("clift-core", "", "error statistics random rgb_image files geometry clip_views"),
     (
         "clift-kernels",
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    (
-        "clift-model",
-        "clift-core clift-kernels",
-        "error names atomic_files device ops views tokens network cost weights codec scene",
-    ),
+    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights codec scene"),
     (
         "clift-data",
         "clift-core",
@@ -28,7 +24,7 @@ const CRATES: [Crate; 9] = [
     (
         "clift-eval",
         "clift-core clift-kernels clift-model clift-data",
-        "error system config metrics upload statistics encode sweep figures report evaluator codec",
+        "error system config metrics statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",

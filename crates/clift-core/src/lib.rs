@@ -12,6 +12,7 @@
 //! # Ok::<(), clift_core::CameraError>(())
 //! ```
 
+mod clip_views;
 mod error;
 mod files;
 mod geometry;
@@ -24,17 +25,18 @@ mod testing;
 // Cameras and poses.
 pub use error::CameraError;
 pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm, widest_fov_deg};
-pub use geometry::camera_path::{PathView, focus_distance, interpolate_path, mean_intrinsics, orbit_path};
+pub use geometry::camera_path::{focus_distance, interpolate_path, mean_intrinsics, orbit_path};
 pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale, check_near};
 pub use geometry::pose::Pose;
 pub use glam::{DMat3, DVec3};
 
 // Images.
+pub use clip_views::ClipViews;
 pub use rgb_image::RgbImage;
 
 // Atomic files.
 pub use files::atomic::{
-    TEMPORARY, make_folder, publish_folder, remove_folder, remove_leftovers, replace_file, sync_folder,
+    TEMPORARY, folder_of, make_folder, publish_file, publish_folder, remove_folder, remove_leftovers, replace_file,
 };
 pub use files::staged_dir::{StagedDir, is_empty_folder};
 

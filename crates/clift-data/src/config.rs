@@ -2,9 +2,8 @@
 
 use std::path::PathBuf;
 
-use serde::{Deserialize, Serialize};
-
 use clift_core::{PoseRotation, PoseScale};
+use serde::{Deserialize, Serialize};
 
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;

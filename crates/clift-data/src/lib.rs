@@ -1,7 +1,7 @@
 //! Files in, clips out: data sets and captures in every layout, synthetic scenes, view samplers and the loader.
 //!
 //! A clip holds the context and target images of one scene with their normalised cameras. This crate does not depend on
-//! Burn: clips are plain host arrays, which `clift_model::Views::upload` copies to a device.
+//! Burn: clips are plain host arrays ([`ClipViews`](clift_core::ClipViews)), which `clift_model::Views::upload` copies to a device.
 //!
 //! ```
 //! use clift_data::{ClipReader, DataConfig, Split, ViewIndices, open_dataset};
@@ -55,7 +55,7 @@ pub use synthetic::config::{Look, SyntheticConfig};
 pub use synthetic::source::SyntheticSource;
 
 // Clips and batches.
-pub use sampling::clip::{Clip, ClipViews, ViewIndices};
+pub use sampling::clip::{Clip, ViewIndices};
 pub use sampling::clip_reader::{ClipOptions, ClipReader};
 pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views, even_views_of};
 pub use sampling::inner_views::InnerViews;

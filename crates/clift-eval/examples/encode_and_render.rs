@@ -13,8 +13,8 @@ use std::path::Path;
 use burn::tensor::{Tensor, TensorData};
 use clift_core::{PoseRotation, PoseScale};
 use clift_data::{ClipOptions, ClipReader, DatasetRoot, SourceOptions, Split, ViewIndices, open_source};
-use clift_eval::{Canvas, EncodeOptions, encode, upload_cameras};
-use clift_model::{DeviceName, Grouping, KMeans, ModelPath, TokenCount, TokenFormat, TrainedModel};
+use clift_eval::{Canvas, EncodeOptions, encode};
+use clift_model::{Cameras, DeviceName, Grouping, KMeans, ModelPath, TokenCount, TokenFormat, TrainedModel};
 
 /// Images are scaled and cropped to the size that the model was trained on.
 const SIZE_PX: usize = 256;
@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let clip = reader.read(0, &ViewIndices { context, target })?;
     let shape = [1, scene.num_tokens(), scene.tokens.len() / scene.num_tokens()];
     let tokens = Tensor::from_data(TensorData::new(scene.tokens, shape), &model.device);
-    let image = model.network.render(tokens, &upload_cameras(&[&clip.target], &model.device)?); // [1, 1, H, W, 3]
+    let image = model.network.render(tokens, &Cameras::upload(&[&clip.target], &model.device)?); // [1, 1, H, W, 3]
     let pixels: Vec<f32> = image.into_data().convert::<f32>().try_to_vec().map_err(|error| format!("{error:?}"))?;
     Canvas::from_unit(&pixels, SIZE_PX, SIZE_PX)?.write_png(Path::new(&format!("{out}.png")))?;
     Ok(())

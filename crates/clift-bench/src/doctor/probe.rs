@@ -7,8 +7,9 @@ use std::time::Instant;
 use burn::optim::GradientsParams;
 use burn::tensor::{DType, Device};
 use clift_data::{Clip, ClipOptions, ClipReader, SyntheticConfig, SyntheticSource, ViewIndices};
-use clift_eval::{upload_cameras, upload_images, upload_views};
-use clift_model::{Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters};
+use clift_model::{
+    Cameras, Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters, Views, upload_images,
+};
 use clift_train::mse;
 
 use crate::cases::reference::flat_gradient;
@@ -97,7 +98,7 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
         ..ModelConfig::default()
     };
     let model = Clift::new(&config, 0, &device);
-    let lift = model.encoder.forward(&upload_views(&[&clip.context], &device)?);
+    let lift = model.encoder.forward(&Views::upload(&[&clip.context], &device)?);
     let num_tokens = lift.dims()[1];
     // The result of K-means is not used: the nearest token may depend on the last bit of a distance.
     let num_clusters = num_tokens / 4;
@@ -106,7 +107,7 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
     let scene = SceneClusters::new(assignment, (0..num_clusters as u32).collect())?;
     let index = Clusters::new(vec![scene])?.upload(&device);
     let tokens = model.condenser.forward(lift, &index);
-    let rendering = model.renderer.forward(tokens, &upload_cameras(&[&clip.target], &device)?);
+    let rendering = model.renderer.forward(tokens, &Cameras::upload(&[&clip.target], &device)?);
     let loss = mse(rendering, upload_images(&[&clip.target], &device)?);
     let grads = GradientsParams::from_grads(loss.backward(), &model);
     Ok(Gradient { loss: loss.into_scalar::<f64>(), values: flat_gradient(&model, &grads) })

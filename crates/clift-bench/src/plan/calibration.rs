@@ -7,8 +7,10 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_core::{item_rng, median, step_rng};
 use clift_data::{ClipReader, Split, open_dataset};
-use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
-use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneSizes, TokenCount, TrainedModel};
+use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene};
+use clift_model::{
+    Cameras, FlopConvention, ModelConfig, Parameters, Part, SceneSizes, TokenCount, TrainedModel, Views,
+};
 use clift_train::{
     BatchTokens, ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TrainError, TypicalStep, clip_global_norm,
     eval_sizes, global_norm, measures_lpips, render_loss, scene_with_all_tokens, seeded_batch, seeded_clip,
@@ -205,8 +207,8 @@ pub fn inference_rates(
     let model = context.model().valid();
     let shape = ClipShape { num_context, num_targets, ..context.shape() };
     let clip = seeded_clip(shape, context.config.seed, 0);
-    let views = upload_views(&[&clip.context], &context.device)?;
-    let cameras = upload_cameras(&[&clip.target], &context.device)?;
+    let views = Views::upload(&[&clip.context], &context.device)?;
+    let cameras = Cameras::upload(&[&clip.target], &context.device)?;
     let scene = scene_with_all_tokens(config, num_context, num_targets)?;
     let [encode_macs, render_macs] =
         [Part::Encoder, Part::Renderer].map(|network| part_macs(&shallow.model, network, &scene));

@@ -38,20 +38,26 @@ impl Pose {
     pub fn from_rows(rows: &[[f64; 4]; 3]) -> Result<Self, CameraError> {
         let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
         let pose = Self { rotation: DMat3::from_rows(x, y, z), translation: rows.map(|row| row[3]).into() };
-        pose.check_finite()?;
-        let defect = pose.orthonormality_defect();
-        if defect > MAX_DEFECT {
-            return Err(CameraError::BadCamera {
-                what: format!("the rotation is off an orthonormal one by {defect:.3e}, more than {MAX_DEFECT:.0e}"),
-            });
-        }
-        let determinant = pose.rotation.determinant();
-        if determinant < 0.0 {
-            return Err(CameraError::BadCamera {
-                what: format!("the rotation mirrors (determinant {determinant:.3})"),
-            });
-        }
+        pose.validate()?;
         Ok(pose)
+    }
+
+    /// Checks that all numbers are finite and that the rotation is orthonormal up to 1e-2 and does not mirror.
+    ///
+    /// # Errors
+    /// [`CameraError::BadCamera`].
+    pub fn validate(self) -> Result<(), CameraError> {
+        self.check_finite()?;
+        let defect = self.orthonormality_defect();
+        let determinant = self.rotation.determinant();
+        let what = if defect > MAX_DEFECT {
+            format!("the rotation is off an orthonormal one by {defect:.3e}, more than {MAX_DEFECT:.0e}")
+        } else if determinant < 0.0 {
+            format!("the rotation mirrors (determinant {determinant:.3})")
+        } else {
+            return Ok(());
+        };
+        Err(CameraError::BadCamera { what })
     }
 
     /// Converts the upper three rows of a camera-to-world matrix with OpenGL camera axes (+x right, +y up, -z forward),
@@ -74,12 +80,17 @@ impl Pose {
         DMat4::from_mat3_translation(self.rotation, self.translation).to_rows_array()
     }
 
-    /// Converts a row-major 4 x 4 matrix. The last row is ignored.
+    /// Converts a row-major 4 x 4 matrix.
     ///
     /// # Errors
-    /// As [`Pose::from_rows`].
+    /// As [`Pose::from_rows`], and [`CameraError::BadCamera`] for another last row than `[0, 0, 0, 1]`.
     pub fn from_matrix(matrix: &[f64; 16]) -> Result<Self, CameraError> {
-        Self::from_rows(&[0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| matrix[row * 4 + column])))
+        let [x, y, z, last] = [0, 4, 8, 12].map(|start| [0, 1, 2, 3].map(|column| matrix[start + column]));
+        if last != [0.0, 0.0, 0.0, 1.0] {
+            let what = format!("the last row of the pose is {last:?}, expected [0, 0, 0, 1]");
+            return Err(CameraError::BadCamera { what });
+        }
+        Self::from_rows(&[x, y, z])
     }
 
     /// Returns the inverse motion `[R^T | -R^T t]` of an orthonormal rotation.

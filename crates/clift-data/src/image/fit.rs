@@ -1,8 +1,7 @@
 //! Images and intrinsics rescaled and cropped to the model's size.
 
-use serde::{Deserialize, Serialize};
-
 use clift_core::{Intrinsics, IntrinsicsNorm, RgbImage};
+use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::image::lanczos::{Window, resize_lanczos_window};

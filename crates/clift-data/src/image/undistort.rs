@@ -1,8 +1,7 @@
 //! Resampling of lens-distorted images to pinhole images.
 
-use rayon::prelude::*;
-
 use clift_core::{IntrinsicsNorm, RgbImage};
+use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::geometry::lens::Lens;

@@ -1,9 +1,8 @@
 //! Context views between the first and the last: random, spread in space, or spread in time.
 
+use clift_core::sample_distinct;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-
-use clift_core::sample_distinct;
 
 /// Selection of the context frames between the first and the last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,9 +1,8 @@
 //! Samples the context and target frames of a training item.
 
+use clift_core::{sample_from, step_rng, uniform_below, uniform_between};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-
-use clift_core::{sample_from, step_rng, uniform_below, uniform_between};
 
 use crate::error::{DataError, check_config};
 use crate::sampling::clip::ViewIndices;

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use clift_core::{Camera, RgbImage};
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
 
 use crate::error::DataError;
 use crate::scene_source::SceneSource;
@@ -72,7 +72,7 @@ impl SceneSource for SceneSubset {
         Ok(if self.hold_out == 0 { num_frames } else { num_frames - num_frames.div_ceil(self.hold_out) })
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         Ok(self.kept(self.source.cameras(self.scenes[scene])?))
     }
 

@@ -1,10 +1,9 @@
 //! A room: box-shaped walls, boxes and balls on the floor, a lamp and a camera path.
 
+use clift_core::{uniform_01, uniform_between};
 use glam::{DVec3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-
-use clift_core::{uniform_01, uniform_between};
 
 use crate::synthetic::camera_path::{CLEARANCE, CameraPath};
 use crate::synthetic::config::SyntheticConfig;

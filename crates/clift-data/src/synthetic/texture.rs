@@ -2,10 +2,9 @@
 
 use std::f32::consts::TAU;
 
+use clift_core::{uniform_01, uniform_below};
 use glam::Vec3;
 use rand::Rng;
-
-use clift_core::{uniform_01, uniform_below};
 
 use crate::synthetic::tracing::noise::smooth;
 

@@ -5,9 +5,8 @@ use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
-use sha2::{Digest, Sha256};
-
 use clift_core::{TEMPORARY, replace_file};
+use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
 use crate::files::listing::has_ending;

@@ -3,9 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use rayon::prelude::*;
-
 use clift_core::{RgbImage, replace_file};
+use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::image::codec::{encode_jpeg, encode_png};

@@ -3,10 +3,9 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use clift_core::{Camera, IntrinsicsNorm, derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-
-use clift_core::{Camera, derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 
 use crate::error::{DataError, check_config};
 use crate::geometry::overlap::overlap;
@@ -77,7 +76,7 @@ impl OverlapOptions {
     /// Frames are visited in random order. The partner of a frame is uniform among the frames at increasing distance, in
     /// both directions, up to the first without enough overlap. The first frame with a partner is used. Targets are
     /// distinct and sorted; inner contexts are distinct and uniform.
-    fn sample_views(&self, key: &str, cameras: &[Camera]) -> Result<ViewIndices, String> {
+    fn sample_views(&self, key: &str, cameras: &[Camera<IntrinsicsNorm>]) -> Result<ViewIndices, String> {
         let num_frames = cameras.len();
         let [near, far] = self.distance;
         if num_frames <= near {
@@ -169,7 +168,7 @@ mod tests {
     use crate::sampling::evaluation_index::EvaluationIndex;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{self, TestSource};
-    use clift_core::{IntrinsicsNorm, Pose};
+    use clift_core::Pose;
     use glam::DMat3;
 
     fn rooms(num_scenes: usize) -> SyntheticSource {
@@ -235,9 +234,9 @@ mod tests {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
         let camera = |frame: usize| {
             let rotation = DMat3::from_rotation_y((3.0 * frame as f64).to_radians());
-            Camera { intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
+            Camera { intrinsics: intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
         };
-        let cameras: Vec<Camera> = (0..60).map(camera).collect();
+        let cameras: Vec<Camera<IntrinsicsNorm>> = (0..60).map(camera).collect();
         let options = |near, far| OverlapOptions { num_targets: 1, distance: [near, far], ..OverlapOptions::default() };
         for key in ["a", "b", "c", "d", "e", "f"] {
             let ViewIndices { context, .. } = options(4, 50).sample_views(key, &cameras).unwrap();

@@ -6,9 +6,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use half::{bf16, f16};
-
 use clift_core::replace_file;
+use half::{bf16, f16};
 
 use crate::error::DataError;
 use crate::torch::archive::{Archive, ByteSpan};

@@ -5,10 +5,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
+use clift_core::{replace_file, widest_fov_deg};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-
-use clift_core::{replace_file, widest_fov_deg};
 
 use crate::error::DataError;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};

@@ -6,10 +6,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::UNIX_EPOCH;
 
+use clift_core::{RgbImage, TEMPORARY};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-
-use clift_core::{RgbImage, TEMPORARY};
 
 use crate::error::{DataError, check_config};
 use crate::files::caches::cache_folder;
@@ -223,7 +222,7 @@ mod tests {
         let cache = cache(root.path(), 1_000_000);
         for (name, lens) in [("a.png", Lens { radial: [0.0; 3], tangential: [0.0; 2] }), ("b.png", distorted)] {
             let photo = photo(root.path(), name, &ramp(647, 801), lens);
-            let fitted = |image: &RgbImage| fit_image(image, photo.camera.intrinsics_norm, 32, 32, false).unwrap();
+            let fitted = |image: &RgbImage| fit_image(image, photo.camera.intrinsics, 32, 32, false).unwrap();
             let expected = fitted(&photo.decode("k", 0).unwrap());
             for is_decoded in [true, false] {
                 let (image, was_decoded) = read_through(&cache, &photo);

@@ -7,10 +7,9 @@ use std::fmt;
 use std::marker::PhantomData;
 use std::path::Path;
 
+use clift_core::{Intrinsics, IntrinsicsNorm, Pose, folder_of};
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
-
-use clift_core::{Intrinsics, IntrinsicsNorm, Pose};
 
 use crate::error::DataError;
 use crate::files::bounded::{parse_json, read_bounded};
@@ -161,7 +160,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
     let document: Document = parse_json(&text).map_err(|error| bad(explain(&error, &text)))?;
     drop(text);
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
     if let Some(Entry { file_path: name, .. }) = entries.iter().find(|entry| entry.file_path.len() > MAX_NAME_BYTES) {
         let start: String = name.chars().take(40).collect();

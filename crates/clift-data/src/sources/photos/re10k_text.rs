@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use clift_core::Camera;
+use clift_core::{Camera, IntrinsicsNorm};
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
@@ -60,7 +60,7 @@ fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Strin
     Ok(scene)
 }
 
-fn parse_line(line: &str) -> Result<(i64, Camera), String> {
+fn parse_line(line: &str) -> Result<(i64, Camera<IntrinsicsNorm>), String> {
     let words: Vec<&str> = line.split_ascii_whitespace().take(NUM_COLUMNS + 1).collect();
     if words.len() != NUM_COLUMNS {
         let more = if words.len() > NUM_COLUMNS { "more" } else { &words.len().to_string() };

@@ -1,8 +1,7 @@
 //! An image of two frames side by side with matched corners and their epipolar lines.
 
-use glam::DMat3;
-
 use clift_core::RgbImage;
+use glam::DMat3;
 
 use crate::tools::features::epipolar::{Correspondence, WIDTH, line, line_back};
 use crate::tools::features::image_features::reduced;
@@ -92,6 +91,7 @@ fn blend(pixel: &mut [u8], colour: [u8; 3], share: f64) {
 
 #[cfg(test)]
 mod tests {
+
     use super::*;
 
     #[test]

@@ -2,9 +2,8 @@
 
 use std::collections::HashMap;
 
-use glam::{DMat3, DQuat, DVec3};
-
 use clift_core::{Intrinsics, IntrinsicsNorm, Pose};
+use glam::{DMat3, DQuat, DVec3};
 
 use crate::error::DataError;
 use crate::geometry::lens::Lens;
