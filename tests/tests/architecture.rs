@@ -7,42 +7,44 @@ use crate::support::{repository, sources};
 /// A crate, the crates that it may use, and its folders and root files: each imports only those that stand before it.
 type Crate = (&'static str, &'static str, &'static str);
 
-const CRATES: [Crate; 8] = [
+const CRATES: [Crate; 9] = [
+    ("clift-core", "", "error statistics random rgb_image files geometry clip_views"),
     (
         "clift-kernels",
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    (
-        "clift-model",
-        "clift-kernels",
-        "error names atomic_files device ops views tokens network cost weights codec scene",
-    ),
+    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights codec scene"),
     (
         "clift-data",
-        "",
-        "bad_config error statistics random skip_report files geometry image torch scene_source synthetic sources sampling config \
+        "clift-core",
+        "error skip_report files geometry image torch scene_source synthetic sources sampling config \
          tools dataset",
     ),
     (
         "clift-eval",
-        "clift-kernels clift-model clift-data",
-        "error system config metrics upload statistics encode sweep figures report evaluator codec",
+        "clift-core clift-kernels clift-model clift-data",
+        "error system config metrics statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",
-        "clift-kernels clift-model clift-data clift-eval",
-        "error version distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
+        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "error version distributed events config step cluster_cache interchange stage checkpoint footprint \
+         fit_token_codec run",
     ),
     (
         "clift-bench",
-        "clift-kernels clift-model clift-data clift-eval clift-train",
+        "clift-core clift-kernels clift-model clift-data clift-eval clift-train",
         "allreduce cases data_reading runner precision doctor",
     ),
-    ("clift-view", "clift-kernels clift-model clift-data clift-eval", "error protocol scenes session server"),
+    (
+        "clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "error protocol scenes session server",
+    ),
     (
         "clift",
-        "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
         "interrupt exit_code output threads commands cli reference_pages",
     ),
 ];

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_data::{BadConfig, median};
+use clift_core::{BadConfig, median};
 use clift_eval::psnr_of_mse;
 use clift_model::{DeviceName, Precision};
 use clift_train::{Config, Stage, TrainError, freeze};

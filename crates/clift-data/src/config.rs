@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
+use clift_core::{PoseRotation, PoseScale};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::normalization::{PoseRotation, PoseScale};
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
 use crate::sampling::view_sampler::ViewSampler;

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::BadConfig;
+use clift_core::BadConfig;
 
 /// An error of this crate. Messages have the problem, the value found, the remedy, and the path last.
 #[derive(Debug, thiserror::Error)]

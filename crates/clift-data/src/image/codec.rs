@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
+use clift_core::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::metadata::Orientation;
@@ -11,7 +12,6 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFo
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::image::rgb_image::RgbImage;
 
 /// Largest number of columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;

@@ -258,7 +258,7 @@ mod tests {
 
     #[test]
     fn unusable_entries_are_skipped_up_to_the_limit() {
-        let broken = || DataError::BadCamera { what: "the pose holds NaN".into() };
+        let broken = || DataError::bad_camera("the pose holds NaN".into());
         let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (5, 8)))
             .with_cameras(move |scene, cameras| if scene == 1 { Err(broken()) } else { Ok(cameras) });
         let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8

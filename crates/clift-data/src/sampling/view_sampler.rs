@@ -1,12 +1,11 @@
 //! Samples the context and target frames of a training item.
 
+use clift_core::{BadConfig, check_config, sample_from, step_rng, uniform_below, uniform_between};
 use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::bad_config::{BadConfig, check_config};
 use crate::error::DataError;
-use crate::random::{sample_from, step_rng, uniform_below, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;

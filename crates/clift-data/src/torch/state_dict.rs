@@ -6,10 +6,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use clift_core::replace_file;
 use half::{bf16, f16};
 
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::file_kind::require_file;
 use crate::torch::pickle::Pickle;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clift_data::{mean, standard_error};
+use clift_core::{mean, standard_error};
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_data::{mean, replace_file};
+use clift_core::{mean, replace_file};
 
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;

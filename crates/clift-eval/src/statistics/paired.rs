@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use clift_data::{mean, standard_error};
+use clift_core::{mean, standard_error};
 use clift_model::TokenCoding;
 use serde::{Deserialize, Serialize};
 

@@ -3,7 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use clift_data::mean;
+use clift_core::mean;
 
 use crate::config::method::Method;
 use crate::statistics::eval_results::EvalResults;

@@ -3,11 +3,11 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use clift_core::replace_file;
 use safetensors::tensor::{Dtype, TensorView};
 use safetensors::{SafeTensors, serialize};
 use sha2::{Digest, Sha256};
 
-use crate::atomic_files::replace;
 use crate::codec::histogram::Distributions;
 use crate::codec::prediction::{NUM_CLASSES, Prediction};
 use crate::codec::rates::RateTable;
@@ -65,7 +65,7 @@ impl TokenCodec {
     /// # Errors
     /// [`ModelError::CodecFile`].
     pub fn write(&self, path: &Path) -> Result<(), ModelError> {
-        let written = to_bytes(self).and_then(|bytes| replace(path, &bytes).map_err(|error| error.to_string()));
+        let written = to_bytes(self).and_then(|bytes| replace_file(path, &bytes).map_err(|error| error.to_string()));
         written.map_err(|reason| ModelError::CodecFile { action: "writing", reason, path: path.into() })
     }
 

@@ -12,8 +12,8 @@ use burn::store::{
     PyTorchToBurnAdapter, SafetensorsStore,
 };
 use burn::tensor::{DType, TensorData};
+use clift_core::{TEMPORARY, folder_of, publish_file};
 
-use crate::atomic_files::{TEMPORARY, folder_of, publish};
 use crate::error::ModelError;
 use crate::weights::hash::visit;
 
@@ -103,7 +103,7 @@ fn write<M: Module>(
         .metadata("format", "clift-1");
     module.save_into(&mut store).map_err(|e| error(e.to_string()))?;
     let sorted = File::options().read(true).write(true).open(&temporary).and_then(|mut file| sort_header(&mut file));
-    sorted.and_then(|()| publish(&temporary, path)).map_err(|e| error(e.to_string()))
+    sorted.and_then(|()| publish_file(&temporary, path)).map_err(|e| error(e.to_string()))
 }
 
 /// Rewrites a safetensors header with sorted keys, which Burn's store writes in random order. The bytes of the tensors stay

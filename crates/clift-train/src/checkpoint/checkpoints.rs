@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
-use clift_data::{make_folder, publish_folder, remove_folder};
+use clift_core::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, first_not_f32};
 
 use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clift_data::{StagedDir, make_folder, remove_leftovers, replace_file};
+use clift_core::{StagedDir, make_folder, remove_leftovers, replace_file};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 

@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use burn::module::Module;
-use clift_data::{make_folder, plural};
+use clift_core::make_folder;
+use clift_data::plural;
 use clift_eval::{peak_bytes, psnr_of_mse};
 use clift_model::{Clift, weights_hash};
 

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_data::{RgbImage, encode_jpeg, encode_png};
+use clift_core::RgbImage;
+use clift_data::{encode_jpeg, encode_png};
 use clift_eval::{Canvas, psnr};
 use clift_model::{DeviceName, PatchGrids, SceneRenderer, SelectionPreset};
 

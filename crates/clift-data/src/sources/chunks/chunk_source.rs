@@ -4,12 +4,11 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, widest_fov_deg};
 use crate::image::codec::decode_image;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::index::read_index;
@@ -280,7 +279,7 @@ impl SceneSource for ChunkSource {
         Ok(self.table(scene)?.1.url.clone())
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_cameras(path)
     }

@@ -3,8 +3,9 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use clift_core::{Camera, IntrinsicsNorm};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::image::codec::check_encoded;
 use crate::sources::chunks::writer::{camera_bytes, timestamp_bytes};
 use crate::torch::archive::{Archive, ByteSpan};
@@ -102,7 +103,7 @@ impl Builder<'_> {
 }
 
 impl SceneTable {
-    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera>, DataError> {
+    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let bytes = self.cameras.read(path)?;
         let numbers: Vec<f64> = match self.camera_type {
             ElementType::F64 => bytes.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
@@ -132,7 +133,12 @@ impl SceneTable {
     }
 
     /// Returns whether these time stamps and cameras, one per frame, equal those of the file after rounding to f32.
-    pub fn is_of(&self, path: &Path, timestamps: &[i64], cameras: &[Camera]) -> Result<bool, DataError> {
+    pub fn is_of(
+        &self,
+        path: &Path,
+        timestamps: &[i64],
+        cameras: &[Camera<IntrinsicsNorm>],
+    ) -> Result<bool, DataError> {
         Ok(self.timestamps.read(path)? == timestamp_bytes(timestamps)
             && self.cameras.read(path)? == camera_bytes(cameras))
     }

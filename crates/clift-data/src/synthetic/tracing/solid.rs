@@ -218,8 +218,8 @@ fn largest_axis(v: Vec3) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
     use crate::synthetic::real::dice::Dice;
+    use clift_core::step_rng;
 
     /// Returns whether a point lies in the shape, by its definition.
     fn contains(solid: &Solid, point: Vec3) -> bool {

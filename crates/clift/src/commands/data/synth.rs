@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
+use clift_core::{TEMPORARY, publish_folder};
 use clift_data::{
-    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, TEMPORARY,
-    plural, publish_folder, read_scene, write_chunks, write_evaluation_index,
+    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, plural,
+    read_scene, write_chunks, write_evaluation_index,
 };
 use clift_eval::EvalConfig;
 use clift_model::ModelConfig;
