@@ -74,7 +74,7 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
 fn latents_are_stored_and_rendered_whole() {
     let place = Place::with(&FIVE);
     let encode = "encode DIR/run --scene synthetic-0-test-00000 -o DIR/room.clift";
-    let encoded = place.clift(&format!("{encode} --tokens f32")).ok().prints("5 of 5 tokens (latents, f32)");
+    let encoded = place.clift(&format!("{encode} --tokens f32")).ok().prints("5 of 5 tokens (all, f32)");
     assert!(!encoded.stdout.contains("clusters"), "{}", encoded.stdout);
     place.clift("render DIR/room.clift --path interpolate --frames 3 -o DIR/frames").ok().prints("5 of 5 tokens");
     place.clift("export DIR/run --format f16 -o DIR/half").ok();
