@@ -7,7 +7,7 @@ use std::process::Command;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use clift_train::{Config, Event, Run, RunOptions, Sink, Stage, read_config};
+use clift_train::{Config, Event, Run, RunOptions, RunStep, Sink, Stage, read_config};
 
 struct Killer {
     moment: String,
@@ -40,10 +40,13 @@ fn main() {
     let config = args.next().expect("a config");
     let (mut set, mut options) = (Vec::new(), RunOptions::default());
     while let (Some(flag), Some(value)) = (args.next(), args.next()) {
-        let stage = |stage: &Stage| stage.name() == value;
+        let named = |step: &RunStep| step.name() == value;
         match flag.as_str() {
             "--set" => set.push(value),
-            "--only" => options.only = [Stage::Stage1, Stage::Clusters, Stage::Stage2].into_iter().find(stage),
+            "--only" => {
+                let steps = [Stage::Stage1.into(), RunStep::Clusters, Stage::Stage2.into()];
+                options.only = steps.into_iter().find(named);
+            }
             _ => panic!("{flag} is not known"),
         }
     }

@@ -77,7 +77,7 @@ pub enum BenchEvent<'a> {
     Finished(&'a BenchRow),
 }
 
-/// Times the cases of `options` on the device of `config`; of LVSM those that it has.
+/// Times the cases of `options` on the device of `config`; of a network without clusters those that it has.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for impossible sizes, [`TrainError::Abandoned`] between two repetitions after `stop` was set, and
@@ -89,8 +89,9 @@ pub fn run_bench(
     report: &mut dyn FnMut(BenchEvent),
 ) -> Result<BenchReport, TrainError> {
     let context = BenchContext::new(config, options)?;
-    let is_measured =
-        |case: &BenchCase| options.cases.contains(case) && (case.is_of_latents() || !config.model.has_latents());
+    let is_measured = |case: &BenchCase| {
+        options.cases.contains(case) && (config.model.architecture.supports_clusters() || !case.needs_clusters())
+    };
     let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(is_measured).collect();
     let total = cases.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;

@@ -1,37 +1,32 @@
-//! Encodes a folder of posed photos as a scene file, and renders the view of one frame from the stored tokens.
+//! Encodes a folder of posed photos as a scene file, renders a view of it, and compares a rendering with a photo.
 //!
 //! ```text
 //! cargo run --release -p clift-eval --example encode_and_render -- RUN PHOTOS OUT
 //! ```
 //!
-//! `RUN` is a run directory with trained weights. `PHOTOS` has images with cameras in any supported layout, such as COLMAP
-//! or nerfstudio. Writes `OUT.clift` and `OUT.png`.
+//! `RUN` is a run directory with trained weights, such as `models/rooms`. `PHOTOS` has images with cameras in any supported
+//! layout, such as COLMAP or nerfstudio. Writes `OUT.clift` and `OUT.png`.
 
 use std::error::Error;
 use std::path::Path;
 
-use burn::tensor::{Tensor, TensorData};
-use clift_data::{
-    ClipOptions, ClipReader, DatasetRoot, PoseRotation, PoseScale, SourceOptions, Split, ViewIndices, open_source,
+use clift_data::{ClipReader, DataConfig, DatasetRoot, SourceOptions, Split, open_source};
+use clift_eval::{Canvas, EncodeOptions, HeldOutFrame, encode};
+use clift_model::{
+    DeviceName, Grouping, KMeans, ModelPath, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel,
 };
-use clift_eval::{Canvas, EncodeOptions, encode, upload_cameras};
-use clift_model::{DeviceName, Grouping, KMeans, ModelPath, TokenCount, TokenFormat, TrainedModel};
-
-/// Images are scaled and cropped to the size that the model was trained on.
-const SIZE_PX: usize = 256;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [run, photos, out] = &arguments[..] else { return Err("usage: encode_and_render RUN PHOTOS OUT".into()) };
 
-    // Open the model and the photos.
+    // Open the model, and the photos in the size and with the normalization of poses that the model was trained on.
     let path = ModelPath::find(Path::new(run))?;
     let model = TrainedModel::open(&path, &path.config()?, &DeviceName::Flex.open()?)?;
     let source = open_source(&DatasetRoot::find(Path::new(photos))?, Split::Test, &SourceOptions::default())?.source;
-    let (pose_rotation, pose_scale) = (PoseRotation::default(), PoseScale::default());
-    let options =
-        ClipOptions { width: SIZE_PX, height: SIZE_PX, pose_rotation, pose_scale, exact_principal_point: false };
-    let reader = ClipReader { source, options };
+    let config: toml::Table = std::fs::read_to_string(path.dir.join("config.toml"))?.parse()?;
+    let data: DataConfig = config["data"].clone().try_into()?;
+    let reader = ClipReader { source, options: data.clip_options() };
 
     // Encode the first scene: four context views, a quarter of the tokens, stored as f16.
     let options = EncodeOptions {
@@ -46,14 +41,15 @@ fn main() -> Result<(), Box<dyn Error>> {
     let scene = encode(&model, &reader, 0, &options)?.scene;
     scene.write(Path::new(&format!("{out}.clift")), TokenFormat::F16)?;
 
-    // Render the middle frame.
-    let context = scene.context_frames.iter().map(|&frame| frame as usize).collect();
-    let target = vec![reader.source.num_frames(0)? / 2];
-    let clip = reader.read(0, &ViewIndices { context, target })?;
-    let shape = [1, scene.num_tokens(), scene.tokens.len() / scene.num_tokens()];
-    let tokens = Tensor::from_data(TensorData::new(scene.tokens, shape), &model.device);
-    let image = model.network.render(tokens, &upload_cameras(&[&clip.target], &model.device)?); // [1, 1, H, W, 3]
-    let pixels: Vec<f32> = image.into_data().convert::<f32>().try_to_vec().map_err(|error| format!("{error:?}"))?;
-    Canvas::from_unit(&pixels, SIZE_PX, SIZE_PX)?.write_png(Path::new(&format!("{out}.png")))?;
+    // Render the second context view from half of the stored tokens: those nearest to its camera.
+    let (renderer, rules) = (model.network.renderer.clone(), SelectionPreset::default().rules());
+    let mut renderer = SceneRenderer::new(&scene, renderer, rules, &model.device)?;
+    let view = renderer.render(&scene.context[1..2], scene.height, scene.width, scene.num_tokens() / 2)?.remove(0);
+    Canvas::from_unit(&view.pixels, scene.width, scene.height)?.write_png(Path::new(&format!("{out}.png")))?;
+
+    // Compare a rendering of a photo that is not a context view with the photo.
+    if let Some(check) = HeldOutFrame::render(&model, &reader, 0, &scene)? {
+        println!("frame {}: {:.2} dB, the nearest context view {:.2} dB", check.frame, check.psnr, check.nearest_psnr);
+    }
     Ok(())
 }

@@ -76,7 +76,7 @@ pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> R
 ///
 /// # Errors
 /// [`ModelError::BadConfig`] for frames that the scene does not have, [`ModelError::BadTokenCount`] for a count above the
-/// number of tokens, [`ModelError::BadConfig`] for fewer latents of LVSM than all, and the errors of reading the images.
+/// number of tokens, [`ModelError::BadConfig`] for fewer tokens than all of a network without clusters, and the errors of reading the images.
 pub fn encode(
     model: &TrainedModel,
     reader: &ClipReader,
@@ -91,22 +91,24 @@ pub fn encode(
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
-    let clusters = if model.config.has_latents() {
-        if options.stored_tokens.of(num_lift_tokens)? != num_lift_tokens {
-            let fix =
-                format!("a scene of lvsm-ed is all its latents, which are not clustered: write {num_lift_tokens}");
-            return Err(bad_config("--stored-tokens", options.stored_tokens.to_string(), fix));
-        }
-        SceneClusters::identity(num_lift_tokens)
-    } else {
+    let architecture = model.config.architecture;
+    let clusters = if architecture.supports_clusters() {
         let grid = [data.height, data.width].map(|side| side / model.config.patch_size);
         let (count, kmeans) = (options.stored_tokens.of(num_lift_tokens)?, (&options.kmeans, seed));
         options.grouping.group(count, (clip.context.num_views(), grid), kmeans, || lift.values.clone())?
+    } else {
+        if options.stored_tokens.of(num_lift_tokens)? != num_lift_tokens {
+            let fix = format!(
+                "a scene of {architecture} is all its tokens, which are not clustered: write {num_lift_tokens}"
+            );
+            return Err(bad_config("--stored-tokens", options.stored_tokens.to_string(), fix));
+        }
+        SceneClusters::identity(num_lift_tokens)
     };
     let cluster_error = clusters.variance_within(&host_values(&lift)?);
     let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
-    let (kind, tokens) = if model.config.has_latents() {
-        (TokenKind::Latents, lift)
+    let (kind, tokens) = if !architecture.supports_clusters() {
+        (TokenKind::All, lift)
     } else if model.has_condenser {
         (TokenKind::Clift, model.network.compress(lift, &index))
     } else {

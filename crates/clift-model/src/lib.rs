@@ -75,13 +75,14 @@ pub use tokens::selection::token_ray::TokenRay;
 // Networks
 pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
 pub use network::camera_encoding::TokenTransforms;
-pub use network::clift::Clift;
-pub use network::condenser::Condenser;
+pub use network::model::Clift;
+pub use network::parts::condenser::Condenser;
+pub use network::parts::encoder::Encoder;
+pub use network::parts::renderer::Renderer;
+pub use network::pass::{Pass, PassState, TokenStep};
 pub use network::config::{CondenserConfig, ModelConfig};
-pub use network::encoder::Encoder;
 pub use network::init::Init;
 pub use network::render_tokens::{KeyValueCache, RenderTokens};
-pub use network::renderer::Renderer;
 pub use network::tokens::Tokens;
 // Layers and operations of the networks
 pub use network::blocks::attention::SelfAttention;

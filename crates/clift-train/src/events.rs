@@ -8,25 +8,49 @@ use serde::{Deserialize, Serialize};
 
 use crate::distributed::ranks::Ranks;
 
-/// One part of a run.
+/// A training stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum Stage {
     /// Encoder and renderer.
     Stage1,
-    /// The cluster cache, on which stage 2 trains.
-    Clusters,
     /// Condenser, and the renderer at a smaller learning rate.
     Stage2,
-    /// The evaluation after training.
-    Eval,
 }
 
 impl Stage {
     /// Returns the name in files, on the command line and of folders.
     pub fn name(self) -> &'static str {
         self.into()
+    }
+}
+
+/// A step of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RunStep {
+    /// The updates of a stage.
+    Train(Stage),
+    /// The cluster cache, on which stage 2 trains.
+    Clusters,
+    /// The evaluation after training.
+    Eval,
+}
+
+impl RunStep {
+    /// Returns the name in files, on the command line and of folders.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Train(stage) => stage.name(),
+            Self::Clusters => "clusters",
+            Self::Eval => "eval",
+        }
+    }
+}
+
+impl From<Stage> for RunStep {
+    fn from(stage: Stage) -> Self {
+        Self::Train(stage)
     }
 }
 
@@ -65,10 +89,10 @@ pub enum Event {
         /// Number of all chunks.
         total: usize,
     },
-    /// A stage starts or resumes.
-    StageStarted {
-        /// The stage.
-        stage: Stage,
+    /// A step of the run starts or resumes.
+    StepStarted {
+        /// The step of the run.
+        run_step: RunStep,
         /// Steps done before: 0, or the step of the checkpoint.
         done: u64,
         /// Number of steps; of context sets for the cluster cache.
@@ -104,10 +128,10 @@ pub enum Event {
         /// Peak memory of the process; `None` if the system does not report it.
         peak_bytes: Option<u64>,
     },
-    /// A stage without updates has processed a context set or a scene.
+    /// A context set of the cluster cache or a scene of an evaluation was processed.
     Progress {
-        /// The stage.
-        stage: Stage,
+        /// The step of the run.
+        run_step: RunStep,
         /// Number done.
         done: u64,
         /// Number in total.
@@ -142,10 +166,10 @@ pub enum Event {
     Warning(String),
     /// Information for the log.
     Message(String),
-    /// A stage is finished.
-    StageFinished {
-        /// The stage.
-        stage: Stage,
+    /// A step of the run is finished.
+    StepFinished {
+        /// The step of the run.
+        run_step: RunStep,
         /// Seconds of wall time since the start or the resumption.
         elapsed_s: f64,
     },
@@ -175,11 +199,11 @@ pub(crate) struct EvalEvents<'a> {
 
 impl EvalProgress for EvalEvents<'_> {
     fn done(&mut self, scenes: usize, total: usize) {
-        let (stage, done, total) = (Stage::Eval, scenes as u64, total as u64);
+        let (run_step, done, total) = (RunStep::Eval, scenes as u64, total as u64);
         match (self.is_stage, done) {
             (false, _) => {}
-            (true, 0) => self.sink.event(&Event::StageStarted { stage, done, num_steps: total }),
-            (true, _) => self.sink.event(&Event::Progress { stage, done, total }),
+            (true, 0) => self.sink.event(&Event::StepStarted { run_step, done, num_steps: total }),
+            (true, _) => self.sink.event(&Event::Progress { run_step, done, total }),
         }
     }
 

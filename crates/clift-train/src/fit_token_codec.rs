@@ -19,7 +19,8 @@ use crate::events::{EvalEvents, Event, Sink};
 /// codec beside the weights.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for a run on tiles, whose tokens no scene file stores, and for LVSM; those of the fit.
+/// [`TrainError::BadConfig`] for a run on tiles, whose tokens no scene file stores, and for a network without
+/// clusters; those of the fit.
 pub fn fit_token_codec(
     config: &Config,
     model: (&TrainedModel, &Path),
@@ -28,8 +29,8 @@ pub fn fit_token_codec(
     sink: &mut dyn Sink,
 ) -> Result<FittedCodec, TrainError> {
     let (model, weights) = model;
-    if config.model.has_latents() {
-        let fix = "the token codec is one of condensed tokens; latents are stored in f32, f16 or int8";
+    if !config.model.architecture.supports_clusters() {
+        let fix = "the token codec is one of condensed tokens; those of this network are stored in f32, f16 or int8";
         return Err(bad("model.architecture", format!("\"{}\"", config.model.architecture), fix));
     }
     if config.clusters.grouping != Grouping::Kmeans {

@@ -50,7 +50,7 @@ pub use distributed::parts::BatchParts;
 pub use distributed::ranks::{Ranks, sent_bytes};
 // A run, its events and errors
 pub use error::TrainError;
-pub use events::{Event, Sink, Stage, StepEvent};
+pub use events::{Event, RunStep, Sink, Stage, StepEvent};
 pub use fit_token_codec::fit_token_codec;
 pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;

@@ -31,7 +31,9 @@ fn its_one_stage_trains_and_resumes_exactly() {
         place.train(&whole, &set).ok().notes("the run is trained and evaluated");
     }
     place.train("other --only stage2", &LVSM).fails_with(2, &["`--only` = stage2", "lvsm-ed\" has one stage"]);
-    place.train("subsets", &LVSM[..3]).fails_with(2, &["`stage1.keep_tokens`", "reads all latents: write [1.0, 1.0]"]);
+    place
+        .train("subsets", &LVSM[..3])
+        .fails_with(2, &["`stage1.keep_tokens`", "renders from all tokens: write [1.0, 1.0]"]);
 }
 
 #[test]
@@ -63,7 +65,7 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
     assert!(place.text("out/report.html").contains("Quality against stored values"));
 
     place.eval("run --with DIR/five --with DIR/five").fails_with(2, &["as many latents"]);
-    place.eval("five --render 2").fails_with(2, &["`eval.render`", "belong to no view"]);
+    place.eval("five --render 2").fails_with(2, &["`eval.render`", "are rendered from all tokens"]);
     place.eval("five --preset main").fails_with(2, &["has the method lvsm_ed alone"]);
     place.clift("codec DIR/five").fails_with(2, &["`model.architecture`"]);
 }
@@ -81,7 +83,7 @@ fn latents_are_stored_and_rendered_whole() {
     place
         .clift("render DIR/room.clift --path orbit --render 2 -o DIR/few")
         .fails_with(2, &["none can be selected by the camera"]);
-    place.clift("view DIR/room.clift --no-open").fails_with(2, &["latents of lvsm-ed lie nowhere"]);
+    place.clift("view DIR/room.clift --no-open").fails_with(2, &["learned tokens of lvsm-ed lie nowhere"]);
     place.clift("export DIR/run --format pytorch -o DIR/a.pt").fails_with(2, &["write --format f16"]);
     for (flags, part) in [
         ("--stored-tokens 2", "not clustered: write 5"),

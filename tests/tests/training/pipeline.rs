@@ -39,7 +39,7 @@ fn a_run_writes_every_documented_file() {
     for line in ["steps = 6", "dim = 16", "max_grad_norm = 1.0", "crop = \"protocol\""] {
         assert!(config.contains(line), "{line}: {config}");
     }
-    assert_eq!(place.json("run/run.json"), serde_json::json!({"version": 1, "overfit": null, "extended": []}));
+    assert_eq!(place.json("run/run.json"), serde_json::json!({"version": 2, "overfit": null, "extended": []}));
 
     let lines = place.metrics("run");
     let steps = lines.iter().map(|line| (line["stage"].as_str().unwrap(), line["step"].as_u64().unwrap()));

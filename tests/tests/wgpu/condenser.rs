@@ -61,5 +61,7 @@ fn paper(residual: bool) -> ModelConfig {
 fn condense(place: &Place, config: &ModelConfig, lift: Tensor<3>, scenes: Vec<SceneClusters>) -> Values {
     let condenser = place.module(|init| Condenser::new(config, init));
     let index = Clusters::new(scenes).expect("equal counts").upload(&place.device);
-    place.differentiate(&condenser, [lift.detach()], |condenser, [lift]| condenser.forward(lift, &index).values)
+    place.differentiate(&condenser, [lift.detach()], |condenser, [lift]| {
+        condenser.forward(Tokens::without_cameras(lift), &index).values
+    })
 }

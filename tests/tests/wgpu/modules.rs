@@ -4,7 +4,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use clift_model::{
     Activation, Architecture, CameraEncoding, CliftVariant, CondenserConfig, DecoderBlock, Encoder, EncoderBlock,
-    FeedForward, Init, LiftNorm, ModelConfig, RenderTokens, Renderer, SelfAttention, cross_sdpa, gelu_linear, linear,
+    FeedForward, LiftNorm, ModelConfig, RenderTokens, Renderer, SelfAttention, Tokens, cross_sdpa, gelu_linear, linear,
     norm_linear, patchify, plucker, self_sdpa, unpatchify,
 };
 use clift_train::mse;
@@ -133,24 +133,27 @@ fn feed_forward(place: &Place, activation: Activation) -> Values {
 }
 
 fn self_attention(place: &Place, variant: CliftVariant) -> Values {
-    let layers = place.module(|init| (init.layer_norm(DIM), SelfAttention::new(&network(variant), init)));
+    let network = network(variant);
+    let layers = place.module_of(&network, |init| (init.layer_norm(DIM), SelfAttention::new(&network, init)));
     place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x, None))
 }
 
 fn decoder_block(place: &Place, variant: CliftVariant) -> Values {
-    let block = place.module(|init| DecoderBlock::new(&network(variant), init));
+    let network = network(variant);
+    let block = place.module_of(&network, |init| DecoderBlock::new(&network, init));
     let inputs = [place.random([BATCH * VIEWS, 6, DIM], 1), place.tokens(2)];
-    place
-        .differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.project_tokens(tokens.into()), None))
+    place.differentiate(&block, inputs, |block, [x, tokens]| {
+        block.forward(x, block.project_tokens(Tokens::without_cameras(tokens)), None)
+    })
 }
 
 fn encode(place: &Place, network: &ModelConfig) -> Values {
-    let encoder = place.module(|_| Encoder::new(network, &mut Init::of(network, 7, &place.device)));
+    let encoder = place.module_of(network, |init| Encoder::new(network, init));
     let context = place.context();
     place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).values)
 }
 
-fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
+fn render(place: &Place, choose: impl Fn(Tokens) -> RenderTokens) -> Values {
     render_network(place, &network(CliftVariant::Paper), choose)
 }
 
@@ -159,10 +162,12 @@ fn lvsm(variant: CliftVariant) -> ModelConfig {
     ModelConfig { architecture, num_latents, condenser, ..network(variant) }
 }
 
-fn render_network(place: &Place, network: &ModelConfig, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
-    let renderer = place.module(|_| Renderer::new(network, &mut Init::of(network, 7, &place.device)));
+fn render_network(place: &Place, network: &ModelConfig, choose: impl Fn(Tokens) -> RenderTokens) -> Values {
+    let renderer = place.module_of(network, |init| Renderer::new(network, init));
     let targets = place.targets();
-    place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| renderer.forward(choose(tokens), &targets))
+    place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| {
+        renderer.forward(choose(Tokens::without_cameras(tokens)), &targets)
+    })
 }
 
 /// `count` tokens for every view of every scene; views share some.

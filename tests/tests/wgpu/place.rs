@@ -6,8 +6,7 @@ use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{
-    Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, LiftNorm, ModelConfig, Renderer,
-    SceneClusters,
+    Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, ModelConfig, Renderer, SceneClusters,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -66,13 +65,18 @@ impl Place {
         make(&mut Init::new(7, &self.device)).map(&mut Move)
     }
 
+    /// Makes a module of a network as [`module`](Self::module), with the norms and biases that its layers have.
+    pub fn module_of<M: Module>(&self, network: &ModelConfig, make: impl FnOnce(&mut Init) -> M) -> M {
+        make(&mut Init::of(network, 7, &self.device)).map(&mut Move)
+    }
+
     pub fn model(&self) -> Clift {
         let config = network(CliftVariant::Paper);
         self.module(|init| Clift {
             encoder: Encoder::new(&config, init),
             renderer: Renderer::new(&config, init),
             condenser: Condenser::new(&config, init),
-            lift_norm: LiftNorm::new(&config, init),
+            lift_norm: None,
         })
     }
 

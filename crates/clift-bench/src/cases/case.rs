@@ -49,9 +49,9 @@ impl BenchCase {
         Self::ALL.iter().map(|case| case.name()).collect::<Vec<_>>().join(", ")
     }
 
-    /// Whether the case is also one of LVSM, whose tokens are neither clustered nor selected.
-    pub const fn is_of_latents(self) -> bool {
-        matches!(self, Self::Encode | Self::Render | Self::Render8Views | Self::Stage1Step)
+    /// Whether the case clusters, condenses or selects tokens.
+    pub const fn needs_clusters(self) -> bool {
+        !matches!(self, Self::Encode | Self::Render | Self::Render8Views | Self::Stage1Step)
     }
 
     /// Whether the error is measured on a smaller problem than the time.

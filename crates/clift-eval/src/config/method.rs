@@ -1,6 +1,6 @@
 //! Rendering methods: own methods, two baselines, and external methods by name.
 
-use clift_model::Grouping;
+use clift_model::{Architecture, Grouping};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::EvalError;
@@ -10,8 +10,7 @@ const MAX_NAME: usize = 40;
 const MAX_CHAR_BYTES: usize = 4;
 
 /// A method that makes images of target views.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, strum::IntoStaticStr)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, strum::IntoStaticStr)]
 #[strum(serialize_all = "snake_case")]
 pub enum Method {
     /// Condensed K-means clusters: the method of the paper.
@@ -24,34 +23,42 @@ pub enum Method {
     TileClift,
     /// A random subset of all tokens.
     Random,
-    /// All latents of LVSM's encoder-decoder, a network of its own.
-    LvsmEd,
+    /// All tokens of a network without clusters.
+    Whole(Architecture),
     /// Baseline: the nearest context view.
     NearestView,
     /// Baseline: the mean of the context views.
     MeanImage,
     /// Images of a method of another program.
-    #[serde(untagged)]
     External(MethodName),
 }
 
 impl Method {
-    /// The methods of this program.
-    pub const OWN: [Self; 8] = [
-        Self::Clift,
-        Self::Kmeans,
-        Self::Tile,
-        Self::TileClift,
-        Self::Random,
-        Self::LvsmEd,
-        Self::NearestView,
-        Self::MeanImage,
-    ];
+    /// Returns the methods of this program.
+    pub fn own() -> impl Iterator<Item = Self> {
+        let clustered = [Self::Clift, Self::Kmeans, Self::Tile, Self::TileClift, Self::Random];
+        clustered.into_iter().chain(Self::whole()).chain([Self::NearestView, Self::MeanImage])
+    }
+
+    /// Returns the methods of the networks without clusters.
+    pub fn whole() -> impl Iterator<Item = Self> {
+        let architectures = Architecture::ALL.iter().copied();
+        architectures.filter(|architecture| !architecture.supports_clusters()).map(Self::Whole)
+    }
+
+    /// Returns the network without clusters whose method it is.
+    pub const fn network(self) -> Option<Architecture> {
+        match self {
+            Self::Whole(architecture) => Some(architecture),
+            _ => None,
+        }
+    }
 
     /// Returns the name in files and tables.
     pub fn name(&self) -> &str {
         match self {
             Self::External(name) => name.as_str(),
+            Self::Whole(architecture) => architecture.method_name(),
             own => (*own).into(),
         }
     }
@@ -61,7 +68,7 @@ impl Method {
         match self {
             Self::Clift | Self::Kmeans => Some(Grouping::Kmeans),
             Self::TileClift | Self::Tile => Some(Grouping::Tile),
-            Self::Random | Self::LvsmEd | Self::NearestView | Self::MeanImage | Self::External(_) => None,
+            Self::Random | Self::Whole(_) | Self::NearestView | Self::MeanImage | Self::External(_) => None,
         }
     }
 
@@ -97,7 +104,7 @@ impl MethodName {
         if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {
             return Err(bad("use 1 to 40 printable characters"));
         }
-        if Method::OWN.iter().any(|own| own.name() == name) {
+        if Method::own().any(|own| own.name() == name) {
             return Err(bad("reserved for a method of clift; choose another name"));
         }
         let mut bytes = [0; MAX_NAME * MAX_CHAR_BYTES];
@@ -123,6 +130,22 @@ impl<'de> Deserialize<'de> for MethodName {
     }
 }
 
+impl Serialize for Method {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Method {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let name = String::deserialize(deserializer)?;
+        match Self::own().find(|method| method.name() == name) {
+            Some(method) => Ok(method),
+            None => MethodName::new(&name).map(Self::External).map_err(serde::de::Error::custom),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -142,11 +165,13 @@ mod tests {
     #[test]
     fn names_are_equal_in_json_and_csv() {
         let other = Method::External(MethodName::new("MVSplat").unwrap());
-        for method in Method::OWN.into_iter().chain([other]) {
+        for method in Method::own().chain([other]) {
             assert_eq!(serde_json::to_value(method).unwrap(), method.name());
             assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
         }
-        assert_eq!(Method::OWN.each_ref().map(Method::name)[3..7], ["tile_clift", "random", "lvsm_ed", "nearest_view"]);
+        let own: Vec<Method> = Method::own().collect();
+        let names: Vec<&str> = own.iter().map(Method::name).collect();
+        assert_eq!(names[3..7], ["tile_clift", "random", "lvsm_ed", "nearest_view"]);
         assert!(serde_json::from_value::<Method>("".into()).is_err());
     }
 }

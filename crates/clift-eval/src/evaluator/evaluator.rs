@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural, replace_file};
-use clift_model::{ModelError, TokenCoding};
+use clift_model::{Architecture, ModelError, TokenCoding};
 
 use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
@@ -63,7 +63,7 @@ impl Evaluator {
         // An early check: a run must not fail after training.
         let tokens_per_view = sweep.model.num_patches(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
-        check_counts(&eval, fewest_views * tokens_per_view, sweep.model.has_latents())?;
+        check_counts(&eval, fewest_views * tokens_per_view, sweep.model.architecture)?;
         Ok(Self { eval, sweep, description, reader, items, split, skip_report, device: device.clone() })
     }
 
@@ -264,29 +264,35 @@ impl Evaluator {
         Err(EvalError::NoPredictions { name, expected: summary.num_views, first, path })
     }
 
-    /// Returns the methods of the config, or all methods with weights. Models of LVSM beside the run are always measured.
+    /// Returns the methods of the config, or all methods with weights. Networks without clusters
+    /// beside the run are always measured.
     fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
         let requested = &self.eval.methods;
         if requested.is_empty() {
             return Ok(models.methods());
         }
         let Some(method) = requested.iter().find(|method| models.for_method(**method).is_none()) else {
-            let beside = (!models.lvsm.is_empty() && !requested.contains(&Method::LvsmEd)).then_some(Method::LvsmEd);
+            let beside = Method::whole().filter(|method| models.for_method(*method).is_some());
+            let beside = beside.filter(|method| !requested.contains(method));
             return Ok(requested.iter().copied().chain(beside).collect());
         };
+        let architecture = models.stage1.config.architecture;
         let fix = match method {
-            _ if models.is_of_latents() => {
-                "a run with model.architecture = \"lvsm-ed\" has the method lvsm_ed alone; leave the key and --preset out"
+            _ if !architecture.supports_clusters() => format!(
+                "a run with model.architecture = \"{architecture}\" has the method {} alone; leave the key and --preset \
+                 out",
+                Method::Whole(architecture).name()
+            ),
+            Method::Whole(other) => {
+                format!("the run is another network; add runs with model.architecture = \"{other}\" with --with")
             }
-            Method::LvsmEd => "the run is no LVSM; add runs with model.architecture = \"lvsm-ed\" with --with",
-            Method::Clift => "stage 2 was not trained on K-means clusters; remove the method",
-            Method::TileClift => {
-                "stage 2 was not trained on tiles; train a run with clusters.grouping = \"tile\" and \
-                 stage1.init_from = this run, and pass the new run with --with"
-            }
-            _ => "baselines are always measured; remove the method",
+            Method::Clift => "stage 2 was not trained on K-means clusters; remove the method".into(),
+            Method::TileClift => "stage 2 was not trained on tiles; train a run with clusters.grouping = \"tile\" and \
+                                  stage1.init_from = this run, and pass the new run with --with"
+                .into(),
+            _ => "baselines are always measured; remove the method".into(),
         };
-        let (value, fix) = (method.name().into(), fix.into());
+        let value = method.name().into();
         Err(ModelError::BadConfig { key: "eval.methods", value, fix }.into())
     }
 }
@@ -300,14 +306,14 @@ pub struct SceneLimits {
     pub num_figures: usize,
 }
 
-/// Refuses storage counts above `fewest_tokens`, the smallest scene, and render counts that no scene would use: none of LVSM,
-/// which has one count of stored tokens.
-fn check_counts(eval: &EvalConfig, fewest_tokens: usize, has_latents: bool) -> Result<(), EvalError> {
+/// Refuses storage counts above `fewest_tokens`, the smallest scene, and render counts that no scene would use: a network
+/// without clusters stores and renders all tokens.
+fn check_counts(eval: &EvalConfig, fewest_tokens: usize, architecture: Architecture) -> Result<(), EvalError> {
     let bad = |key, value: String, fix| Err(ModelError::BadConfig { key, value, fix }.into());
-    if has_latents {
+    if !architecture.supports_clusters() {
         let Some(count) = eval.render.first() else { return Ok(()) };
-        let fix = "the latents of lvsm-ed belong to no view, so that none can be selected by the camera: write []";
-        return bad("eval.render", count.to_string(), fix.into());
+        let fix = format!("views of {architecture} are rendered from all tokens: write []");
+        return bad("eval.render", count.to_string(), fix);
     }
     let counts = eval.stored_tokens.iter().map(|count| ("eval.stored_tokens", count));
     for (key, count) in counts.chain([("eval.validation_stored_tokens", &eval.validation_stored_tokens)]) {

@@ -27,7 +27,7 @@ pub fn plots(summary: &Summary) -> Vec<Plot> {
         });
     }
     // Of one network, values are tokens and work is nearly linear in them.
-    if has(|point| point.key.method == Method::LvsmEd) && has(|point| point.key.method == Method::Clift) {
+    if has(|point| point.key.method.network().is_some()) && has(|point| point.key.method == Method::Clift) {
         let values = |point: &SummaryPoint| point.cost.scene_values.map(|count| count as f64);
         let gmac = |point: &SummaryPoint| point.cost.gflops;
         plots.push(Plot {
@@ -57,8 +57,8 @@ fn look(summary: &Summary, method: Method) -> Look {
         Method::Tile => Look::ALL[3],
         // Baselines are levels, not series.
         Method::TileClift | Method::NearestView | Method::MeanImage => Look::ALL[4],
-        Method::LvsmEd | Method::External(_) => {
-            let is_other = |method: &Method| matches!(method, Method::LvsmEd | Method::External(_));
+        Method::Whole(_) | Method::External(_) => {
+            let is_other = |method: &Method| matches!(method, Method::Whole(_) | Method::External(_));
             let methods = summary.points.iter().map(|point| point.key.method);
             let others: BTreeSet<_> = methods.filter(is_other).collect();
             let index = others.into_iter().position(|other| other == method).unwrap_or_default();

@@ -65,9 +65,10 @@ fn image_rows(figure: &SceneFigure) -> io::Result<Markup> {
         (image_html(&figure.target, &format!("Target view, frame {target_frame}"), frame(target_frame))?)
         @for nearest in of(Method::NearestView) { (rendering(nearest, "nearest view")?) }
     };
+    let clustered = [Method::Clift, Method::Kmeans, Method::TileClift, Method::Tile, Method::Random];
     Ok(html! {
         (row("target", target))
-        @for method in [Method::Clift, Method::Kmeans, Method::TileClift, Method::Tile, Method::Random, Method::LvsmEd] {
+        @for method in clustered.into_iter().chain(Method::whole()) {
             (strip(method.name(), &of(method).filter(|image| image.key.is_whole()).collect::<Vec<_>>())?)
             @if Some(method) == best { (errors(&figure.images)?) }
         }

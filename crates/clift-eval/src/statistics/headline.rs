@@ -14,7 +14,7 @@ const MAX_COLUMNS: usize = 80;
 const MAX_COUNTS: usize = 8;
 
 impl Summary {
-    /// Returns PSNR over stored tokens of the main method, of K-means, of random tokens and of LVSM, and of the baselines: at
+    /// Returns PSNR over stored tokens of the main method, of K-means, of random tokens and of networks without clusters, and of the baselines: at
     /// most six lines of at most 80 columns, then warnings about figures that mislead. Views are rendered from all stored
     /// tokens, in the finest number format; of many counts, those evenly spread are shown.
     pub fn headline(&self) -> String {
@@ -29,8 +29,8 @@ impl Summary {
         for count in &shown {
             let _ = write!(text, " {count:>6}");
         }
-        let others =
-            [Method::Kmeans, Method::Random, Method::LvsmEd].into_iter().filter(|method| Some(*method) != best);
+        let others = [Method::Kmeans, Method::Random].into_iter().chain(Method::whole());
+        let others = others.filter(|method| Some(*method) != best);
         for method in best.into_iter().chain(others) {
             let psnr = |count: usize| {
                 let of_method = whole.clone().filter(|point| point.key.method == method);

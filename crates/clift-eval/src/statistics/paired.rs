@@ -13,14 +13,13 @@ use crate::config::method::Method;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
-/// Pairs of methods, the better method of the paper first (sections 4.2, 4.3).
-const ORDERINGS: [[Method; 2]; 6] = [
+/// Pairs of methods, the better method of the paper first (sections 4.2, 4.3); it is compared with other networks too.
+const ORDERINGS: [[Method; 2]; 5] = [
     [Method::Kmeans, Method::Random],
     [Method::Clift, Method::Kmeans],
     [Method::Kmeans, Method::Tile],
     [Method::TileClift, Method::Tile],
     [Method::Clift, Method::TileClift],
-    [Method::Clift, Method::LvsmEd],
 ];
 
 /// Mean PSNR difference of two methods on the same scenes, rendered from all stored tokens.
@@ -45,7 +44,8 @@ pub struct PairedDifference {
 /// Compares the methods of every pair at equal token counts, by pair and ascending count.
 pub fn differences(results: &EvalResults) -> Vec<PairedDifference> {
     let mut differences = Vec::new();
-    for [method, against] in ORDERINGS {
+    let networks = Method::whole().map(|network| [Method::Clift, network]);
+    for [method, against] in ORDERINGS.into_iter().chain(networks) {
         for (key, better) in results.views().filter(|(key, _)| key.method == method && key.is_whole()) {
             let tokens = if against == Method::Random { Some(TokenCoding::F32) } else { key.tokens };
             let Some(other) = results.of(EvalKey { method: against, tokens, ..key }) else { continue };

@@ -259,7 +259,7 @@ fn timed(results: &EvalResults, key: EvalKey) -> (Vec<f64>, Vec<f64>, Vec<f64>) 
     let is_same = |other: EvalKey| {
         let has_same_selection =
             other.is_whole() && key.is_whole() || other.num_storage_tokens == key.num_storage_tokens;
-        let has_same_network = (other.method == Method::LvsmEd) == (key.method == Method::LvsmEd);
+        let has_same_network = other.method.network() == key.method.network();
         let has_same_count = other.num_render_tokens == key.num_render_tokens && other.num_render_tokens > 0;
         has_same_network && has_same_count && has_same_selection
     };
@@ -380,7 +380,7 @@ mod tests {
         let [f16, int8] = [TokenCoding::F16, TokenCoding::INT8].map(|tokens| EvalKey { tokens: Some(tokens), ..CLIFT });
         let random = EvalKey { method: Method::Random, ..f16 };
         let all = EvalKey { num_storage_tokens: 32, ..f16 };
-        let lvsm = EvalKey { method: Method::LvsmEd, ..f16 };
+        let lvsm = EvalKey { method: Method::Whole(clift_model::Architecture::LvsmEd), ..f16 };
         for frame in 0..8 {
             // Noise of the machine alone: the one with the lowest PSNR happens to be the fastest.
             let ms = 10.0 + frame as f64;

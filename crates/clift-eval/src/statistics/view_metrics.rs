@@ -38,11 +38,13 @@ impl EvalKey {
     }
 }
 
-/// Returns the main method among the keys: a condensed method, else K-means, else random tokens, else LVSM.
+/// Returns the main method among the keys: a condensed method, else K-means, else random tokens, else a
+/// network without clusters.
 pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
     let found: BTreeSet<Method> = keys.into_iter().map(|key| key.method).collect();
-    [Method::Clift, Method::TileClift, Method::Kmeans, Method::Random, Method::LvsmEd]
+    [Method::Clift, Method::TileClift, Method::Kmeans, Method::Random]
         .into_iter()
+        .chain(Method::whole())
         .find(|method| found.contains(method))
 }
 

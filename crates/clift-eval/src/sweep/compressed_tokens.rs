@@ -18,7 +18,7 @@ use crate::upload::{host_values, view_cameras};
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
     pub tokens: Tokens,
-    /// The patch of the context views of every token, `[S]`; none of latents.
+    /// The patch of the context views of every token, `[S]`; empty if all are rendered.
     pub ids: Vec<u32>,
     pub model: &'a TrainedModel,
     /// Size of the scene file; `None` for random subsets, which have no file.
@@ -67,15 +67,15 @@ impl<'a> CompressedTokens<'a> {
         Ok(Self { tokens, ids, model, file_bytes: Some(bytes) })
     }
 
-    /// Returns the latents of a model of LVSM, rounded like the tokens of a scene file.
-    pub fn latents(
+    /// Returns all tokens of a network without clusters, rounded like those of a scene file.
+    pub fn whole(
         model: &'a TrainedModel,
-        latents: Tokens,
+        tokens: Tokens,
         format: TokenFormat,
         num_views: usize,
     ) -> Result<Self, EvalError> {
-        let bytes = scene_file_bytes(&model.config, latents.dims()[1], num_views, format);
-        Ok(Self { tokens: rounded(latents, format)?, ids: Vec::new(), model, file_bytes: Some(bytes) })
+        let bytes = scene_file_bytes(&model.config, tokens.dims()[1], num_views, format);
+        Ok(Self { tokens: rounded(tokens, format)?, ids: Vec::new(), model, file_bytes: Some(bytes) })
     }
 }
 

@@ -6,10 +6,10 @@ use clift_model::{Grouping, TokenCodec, TrainedModel};
 
 use crate::config::method::Method;
 
-/// The models of both stages, which have one encoder, and models of LVSM.
+/// The models of both stages, which have one encoder, and networks without clusters.
 #[derive(Clone, Debug)]
 pub struct EvalModels {
-    /// Renders random subsets and cluster centroids, or is a model of LVSM.
+    /// Renders random subsets and cluster centroids, or is a network without clusters.
     pub stage1: TrainedModel,
     /// Condenses and renders K-means clusters.
     pub stage2: Option<TrainedModel>,
@@ -17,15 +17,15 @@ pub struct EvalModels {
     pub stage2_tiles: Option<TrainedModel>,
     /// Codec of the tokens of `stage2`.
     pub codec: Option<Arc<TokenCodec>>,
-    /// Models of LVSM of distinct numbers of latents: `stage1`, if it is one, or networks beside it.
-    pub lvsm: Vec<TrainedModel>,
+    /// Networks without clusters, of distinct numbers of tokens: `stage1`, if it is one, or networks beside it.
+    pub whole: Vec<TrainedModel>,
 }
 
 impl EvalModels {
     /// Starts with the model of stage 1.
     pub fn new(stage1: TrainedModel) -> Self {
-        let lvsm = stage1.config.has_latents().then(|| stage1.clone()).into_iter().collect();
-        Self { stage1, stage2: None, stage2_tiles: None, codec: None, lvsm }
+        let whole = Some(&stage1).filter(|model| !model.config.architecture.supports_clusters()).cloned();
+        Self { stage1, stage2: None, stage2_tiles: None, codec: None, whole: whole.into_iter().collect() }
     }
 
     /// Sets a model of stage 2, trained on such groups of tokens and on the encoder of stage 1.
@@ -37,16 +37,16 @@ impl EvalModels {
         }
     }
 
-    /// Whether there are only models of LVSM.
-    pub fn is_of_latents(&self) -> bool {
-        self.stage1.config.has_latents()
+    /// Whether stage 1 is a network whose tokens can be clustered.
+    pub fn supports_clusters(&self) -> bool {
+        self.stage1.config.architecture.supports_clusters()
     }
 
-    /// Returns the model that renders a method, one of several of LVSM; `None` without one and for baselines.
+    /// Returns the model that renders a method, the first of several; `None` without one and for baselines.
     pub fn for_method(&self, method: Method) -> Option<&TrainedModel> {
         match method {
-            Method::Random | Method::Tile | Method::Kmeans => Some(&self.stage1).filter(|_| !self.is_of_latents()),
-            Method::LvsmEd => self.lvsm.first(),
+            Method::Random | Method::Tile | Method::Kmeans => Some(&self.stage1).filter(|_| self.supports_clusters()),
+            Method::Whole(network) => self.whole.iter().find(|model| model.config.architecture == network),
             Method::Clift => self.stage2.as_ref(),
             Method::TileClift => self.stage2_tiles.as_ref(),
             Method::NearestView | Method::MeanImage | Method::External(_) => None,
@@ -55,8 +55,9 @@ impl EvalModels {
 
     /// Returns the default methods: every method with a model. Uncondensed tiles need condensed tiles beside them.
     pub fn methods(&self) -> Vec<Method> {
-        let all = [Method::Random, Method::Tile, Method::TileClift, Method::Kmeans, Method::Clift, Method::LvsmEd];
+        let clustered = [Method::Random, Method::Tile, Method::TileClift, Method::Kmeans, Method::Clift];
+        let all = clustered.into_iter().chain(Method::whole());
         let is_wanted = |method: &Method| *method != Method::Tile || self.stage2_tiles.is_some();
-        all.into_iter().filter(|method| self.for_method(*method).is_some()).filter(is_wanted).collect()
+        all.filter(|method| self.for_method(*method).is_some()).filter(is_wanted).collect()
     }
 }

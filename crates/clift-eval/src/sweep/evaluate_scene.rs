@@ -51,12 +51,10 @@ pub fn evaluate_scene(
     let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
     metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
     let mut jobs = Vec::new();
-    if !models.is_of_latents() {
+    if models.supports_clusters() {
         add_jobs(models, &context, &renderer, &kept_views, &mut jobs, (&mut results, metrics))?;
     }
-    if sweep.methods.contains(&Method::LvsmEd) {
-        add_lvsm_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
-    }
+    add_whole_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
     let num_timed =
         jobs.first().and_then(|job| metrics.of(job.key)).map_or(0, |scenes| scenes.values().map(BTreeMap::len).sum());
     for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
@@ -86,8 +84,7 @@ fn add_jobs<'a>(
     let stage1 = &models.stage1.network;
     let features = stage1.features(context);
     // Stage 2 may have trained its own token norm; its tokens are then grouped and condensed after that norm.
-    let normed: Vec<(Method, Tokens)> = Method::OWN
-        .into_iter()
+    let normed: Vec<(Method, Tokens)> = Method::own()
         .filter(|method| method.is_condensed())
         .filter_map(|method| Some((method, models.for_method(method)?)))
         .filter(|(_, model)| model.config.has_token_norm())
@@ -107,7 +104,7 @@ fn add_jobs<'a>(
                 (*of, lift, LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed))
             })
             .collect();
-        for &method in sweep.methods.iter().filter(|method| **method != Method::LvsmEd) {
+        for &method in sweep.methods.iter().filter(|method| method.network().is_none()) {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
             let (lift, clusters) = own.map_or((&lift, &clusters), |(_, lift, clusters)| (*lift, clusters));
             for (i, coding) in sweep.formats(method).into_iter().enumerate() {
@@ -147,8 +144,8 @@ fn add_jobs<'a>(
     Ok(())
 }
 
-/// Adds the renderings of every model of LVSM, each from all its latents.
-fn add_lvsm_jobs<'a>(
+/// Adds the renderings of every network without clusters, each from all its tokens.
+fn add_whole_jobs<'a>(
     models: &'a EvalModels,
     context: &Views,
     renderer: &TargetRenderer,
@@ -157,14 +154,18 @@ fn add_lvsm_jobs<'a>(
     metrics: &mut EvalResults,
 ) -> Result<(), EvalError> {
     let TargetRenderer { clip, sweep, .. } = *renderer;
-    for model in &models.lvsm {
-        let latents = model.network.encode(context);
-        for (i, coding) in sweep.formats(Method::LvsmEd).into_iter().enumerate() {
+    for model in &models.whole {
+        let method = Method::Whole(model.config.architecture);
+        if !sweep.methods.contains(&method) {
+            continue;
+        }
+        let tokens = model.network.encode(context);
+        for (i, coding) in sweep.formats(method).into_iter().enumerate() {
             let TokenCoding::Plain(format) = coding else { continue };
-            let stored = CompressedTokens::latents(model, latents.clone(), format, clip.context.num_views())?;
-            let count = latents.dims()[1];
+            let stored = CompressedTokens::whole(model, tokens.clone(), format, clip.context.num_views())?;
+            let count = tokens.dims()[1];
             let (num_storage_tokens, num_render_tokens) = (count, count);
-            let key = EvalKey { method: Method::LvsmEd, num_storage_tokens, num_render_tokens, tokens: Some(coding) };
+            let key = EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(coding) };
             let job = RenderJob::new(key, &stored, None, if i == 0 { kept_views } else { &[] });
             renderer.warm_up(&job, metrics)?;
             jobs.push(job);

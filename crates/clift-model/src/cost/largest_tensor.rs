@@ -41,7 +41,9 @@ fn tensor(layer: &Layer, sizes: &SceneSizes, num_scenes: usize) -> Option<(Strin
         (LayerKind::Attention { heads, keys, .. }, _) => {
             (format!("a chunk of the {network}'s scores"), scores(rows, heads, keys, sizes, scenes))
         }
-        (LayerKind::Activation { width }, _) => (format!("the {network}'s feed-forward values"), rows * width as u64),
+        (LayerKind::Activation { width, .. }, _) => {
+            (format!("the {network}'s feed-forward values"), rows * width as u64)
+        }
         _ => return None,
     })
 }

@@ -9,7 +9,7 @@ use crate::cost::scene_sizes::SceneSizes;
 use crate::error::ModelError;
 use crate::names::parse_value;
 use crate::network::config::ModelConfig;
-use crate::network::layers::{Layer, LayerKind, Part, Rows};
+use crate::network::layers::{Layer, LayerKind, Part, RENDER_TOKENS, Rows};
 
 /// Multiply-accumulates of a forward pass of one scene, without activations, softmax and the rays of pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -129,10 +129,10 @@ impl ModelConfig {
         let of_patches = |num_patches| self.macs(Part::Renderer, &SceneSizes { num_patches, ..*scene });
         let grids = self.drawn_patches(height, width)?;
         let mut macs: Macs = grids.iter().map(|&num_patches| of_patches(num_patches)).sum();
-        if !self.has_latents() {
-            // Grids share the keys and values of the tokens.
-            macs.linear -= (grids.len() - 1) as u64 * of_patches(0).linear;
-        }
+        // Grids share the keys and values of the tokens.
+        let layers = self.layers();
+        let of_tokens = layers.iter().filter(|layer| layer.part == Part::Renderer && layer.rows == RENDER_TOKENS);
+        macs.linear -= (grids.len() - 1) as u64 * of_tokens.map(|layer| layer.macs(scene).linear).sum::<u64>();
         // The paper counts one norm more than the network has.
         macs.normalized += (scene.num_targets * grids.iter().sum::<usize>() * self.dim) as u64;
         Ok(macs)
@@ -158,7 +158,8 @@ mod tests {
     use burn::tensor::{DType, Device, Tensor};
 
     use super::*;
-    use crate::network::clift::Clift;
+    use crate::network::model::Clift;
+    use crate::network::tokens::Tokens;
     use crate::ops::mac_counter;
     use crate::testing::{random, small_configs};
     use crate::tokens::clusters::{Clusters, SceneClusters};
@@ -226,7 +227,7 @@ mod tests {
                 }
                 let whole = SceneClusters::identity(num_tokens);
                 model.condenser.forward(
-                    random([1, num_tokens, config.dim], 2, &device).cast(DType::F32),
+                    Tokens::without_cameras(random([1, num_tokens, config.dim], 2, &device).cast(DType::F32)),
                     &Clusters::new(vec![whole]).unwrap().upload(&device),
                 );
                 let expected = config.condense_macs(num_tokens, num_tokens);

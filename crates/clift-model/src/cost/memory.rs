@@ -4,8 +4,9 @@
 use crate::cost::largest_tensor::kmeans_values;
 use crate::cost::parameters::Parameters;
 use crate::cost::scene_sizes::SceneSizes;
+use crate::network::blocks::feed_forward::Activation;
 use crate::network::config::ModelConfig;
-use crate::network::layers::{Layer, LayerKind, Part, Rows};
+use crate::network::layers::{Layer, LayerKind, Part, Rows, TARGETS_AND_TOKENS};
 use crate::ops::precision::Precision;
 
 /// Bytes of an f32.
@@ -142,7 +143,7 @@ fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_train
         let rows = scene.num_rows(layer.rows);
         let input = match layer.kind {
             LayerKind::Linear { inputs: width, .. } | LayerKind::LayerNorm { width, .. } => values(rows, width),
-            LayerKind::Activation { width } => {
+            LayerKind::Activation { width, .. } => {
                 hidden = values(rows, width);
                 hidden
             }
@@ -167,8 +168,8 @@ fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_train
         saved += if layer.saves_input { input } else { 0.0 };
         let is_rounded = match layer.kind {
             LayerKind::Attention { .. } => true,
-            // The condenser of the released code has ReLU, which is no operation of its own.
-            LayerKind::Activation { .. } => layer.part != Part::Condenser || !config.has_released_condenser(),
+            // ReLU is not an operation of its own.
+            LayerKind::Activation { activation, .. } => activation == Activation::Gelu,
             _ => false,
         };
         if *precision == Precision::Bf16 && is_rounded {
@@ -211,6 +212,8 @@ pub struct InferenceSizes {
     pub num_parameters: u64,
     /// Parameters read from a file into an existing network.
     pub num_loaded: u64,
+    /// Most rows of a layer of the encoder.
+    pub num_encoder_rows: usize,
     /// Encoder tokens.
     pub num_tokens: usize,
     /// Largest number of clusters; `None` without K-means.
@@ -231,8 +234,9 @@ pub struct InferenceSizes {
 pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     let values = |rows: usize| (rows * config.dim) as f64;
     let x = values(sizes.num_tokens);
-    let patches = (sizes.num_tokens * config.context_patch_len()) as f64;
-    let encode = (x + forward_values(config, x)).max(2.5 * patches + x);
+    let patches = (sizes.num_encoder_rows * config.context_patch_len()) as f64;
+    let rows = values(sizes.num_encoder_rows);
+    let encode = (rows + forward_values(config, rows)).max(2.5 * patches + rows);
     // Centered tokens and distances.
     let distances = |num_clusters| 2.0 * x + kmeans_values(sizes.num_tokens, num_clusters) as f64;
     let kmeans = sizes.num_clusters.map_or(0.0, distances);
@@ -260,11 +264,12 @@ pub(crate) fn render_bytes(
     (F32 * (render_values(config, values(num_render_tokens), num_views, values(num_patches)) + 5.0 * image)) as u64
 }
 
-/// Values of one block: keys and values of tokens of `x` values, and the forward of views of `y` values, or of views with all
-/// latents.
+/// Values of one block: keys and values of tokens of `x` values, and the forward of views of `y` values; or the tokens, and
+/// the forward of views that each have all tokens among their rows.
 fn render_values(config: &ModelConfig, x: f64, num_views: usize, y: f64) -> f64 {
-    if config.has_latents() {
-        let y = y + (num_views * config.num_latents * config.dim) as f64;
+    let joins_tokens = |layer: &Layer| layer.part == Part::Renderer && layer.rows == TARGETS_AND_TOKENS;
+    if config.layers().iter().any(joins_tokens) {
+        let y = y + num_views as f64 * x;
         return x + y + forward_values(config, y);
     }
     3.0 * x + y + forward_values(config, y)

@@ -2,7 +2,7 @@
 
 use crate::error::ModelError;
 use crate::network::config::ModelConfig;
-use crate::network::layers::Rows;
+use crate::network::layers::{Part, Rows};
 
 /// Sizes of one scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,6 +52,13 @@ impl SceneSizes {
         let num_context_patches = config.num_patches(num_context, height, width)?;
         let num_patches = config.num_patches(1, height, width)?;
         Ok(Self { num_context_patches, ..Self::new(num_tokens, num_targets, num_patches) })
+    }
+
+    /// Returns the most rows of a layer of the encoder.
+    pub fn num_encoder_rows(&self, config: &ModelConfig) -> usize {
+        let layers = config.layers();
+        let rows = layers.iter().filter(|layer| layer.part == Part::Encoder).map(|layer| self.num_rows(layer.rows));
+        rows.max().unwrap_or_default() as usize
     }
 
     /// Tokens projected to keys and values: those of the scene, or the subsets of its views, whichever are fewer.

@@ -6,7 +6,21 @@ use strum::{Display, IntoStaticStr, VariantArray};
 use crate::names::{names, parse};
 
 /// Kind of the network.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Serialize,
+    Deserialize,
+    Display,
+    IntoStaticStr,
+    VariantArray,
+)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum Architecture {
@@ -16,6 +30,19 @@ pub enum Architecture {
     /// The encoder-decoder of LVSM (arXiv 2410.17242): learned latents, encoded beside the patches by self-attention, and
     /// decoded beside the target patches by self-attention.
     LvsmEd,
+}
+
+impl Architecture {
+    /// All architectures, in the order of messages and help texts.
+    pub const ALL: &[Self] = Self::VARIANTS;
+
+    /// Returns the name among the methods of an evaluation.
+    pub const fn method_name(self) -> &'static str {
+        match self {
+            Self::Clift => "clift",
+            Self::LvsmEd => "lvsm_ed",
+        }
+    }
 }
 
 /// Variant of the network: that of its paper, or one of the released code's.

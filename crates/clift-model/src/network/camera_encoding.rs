@@ -36,6 +36,11 @@ impl TransformMaker {
         Self { encoding, head_width: dim / num_heads, patch_size }
     }
 
+    /// Whether attention is camera-relative.
+    pub fn is_camera_relative(&self) -> bool {
+        self.encoding != CameraEncoding::Plucker
+    }
+
     /// Makes the transform of every patch of every view, in the order of
     /// [`patchify`](crate::views::patch::patchify); `None` without camera-relative attention.
     ///

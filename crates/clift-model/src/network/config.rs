@@ -1,5 +1,7 @@
 //! Sizes of the networks: the `[model]` section of a config.
 
+use std::fmt::Display;
+
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
@@ -52,6 +54,22 @@ pub struct CondenserConfig {
     pub member_share: bool,
 }
 
+/// The published size of `CLiFT`, without a condenser.
+pub(crate) const SIZES: ModelConfig = ModelConfig {
+    architecture: Architecture::Clift,
+    variant: CliftVariant::Paper,
+    num_latents: 0,
+    dim: 768,
+    num_heads: 8,
+    feed_forward_dim: 2048,
+    num_encoder_blocks: 6,
+    num_renderer_blocks: 6,
+    patch_size: 8,
+    camera_encoding: CameraEncoding::Plucker,
+    patch_grids: PatchGrids::One,
+    condenser: CondenserConfig::NONE,
+};
+
 impl Default for ModelConfig {
     fn default() -> Self {
         ModelSection::default().into()
@@ -71,58 +89,28 @@ impl CondenserConfig {
 /// [`ModelConfig`] in a file. Defaults of sizes depend on architecture and variant.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct ModelSection {
-    architecture: Architecture,
-    variant: CliftVariant,
-    num_latents: Option<usize>,
-    dim: Option<usize>,
-    num_heads: Option<usize>,
-    feed_forward_dim: Option<usize>,
-    num_encoder_blocks: Option<usize>,
-    num_renderer_blocks: Option<usize>,
-    patch_size: Option<usize>,
-    camera_encoding: CameraEncoding,
-    patch_grids: PatchGrids,
-    condenser: CondenserSection,
+pub(crate) struct ModelSection {
+    pub architecture: Architecture,
+    pub variant: CliftVariant,
+    pub num_latents: Option<usize>,
+    pub dim: Option<usize>,
+    pub num_heads: Option<usize>,
+    pub feed_forward_dim: Option<usize>,
+    pub num_encoder_blocks: Option<usize>,
+    pub num_renderer_blocks: Option<usize>,
+    pub patch_size: Option<usize>,
+    pub camera_encoding: CameraEncoding,
+    pub patch_grids: PatchGrids,
+    pub condenser: CondenserSection,
 }
 
 /// [`CondenserConfig`] in a file.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct CondenserSection {
-    num_blocks: Option<usize>,
-    residual: Option<bool>,
-    member_share: bool,
-}
-
-impl From<ModelSection> for ModelConfig {
-    fn from(section: ModelSection) -> Self {
-        let ModelSection { architecture, variant, .. } = section;
-        let condenser = CondenserConfig::of(variant);
-        let (defaults, num_latents, [dim, num_heads, feed_forward_dim]) = match (architecture, variant) {
-            (Architecture::Clift, _) => (condenser, 0, [768, 8, 2048]),
-            (Architecture::LvsmEd, CliftVariant::Paper) => (CondenserConfig::NONE, LATENTS, [768, 12, 3072]),
-            (Architecture::LvsmEd, _) => (CondenserConfig::NONE, LATENTS, [512, 8, 2048]),
-        };
-        Self {
-            architecture,
-            variant,
-            num_latents: section.num_latents.unwrap_or(num_latents),
-            dim: section.dim.unwrap_or(dim),
-            num_heads: section.num_heads.unwrap_or(num_heads),
-            feed_forward_dim: section.feed_forward_dim.unwrap_or(feed_forward_dim),
-            num_encoder_blocks: section.num_encoder_blocks.unwrap_or(6),
-            num_renderer_blocks: section.num_renderer_blocks.unwrap_or(6),
-            patch_size: section.patch_size.unwrap_or(8),
-            camera_encoding: section.camera_encoding,
-            patch_grids: section.patch_grids,
-            condenser: CondenserConfig {
-                num_blocks: section.condenser.num_blocks.unwrap_or(defaults.num_blocks),
-                residual: section.condenser.residual.unwrap_or(defaults.residual),
-                member_share: section.condenser.member_share,
-            },
-        }
-    }
+pub(crate) struct CondenserSection {
+    pub num_blocks: Option<usize>,
+    pub residual: Option<bool>,
+    pub member_share: bool,
 }
 
 impl ModelConfig {
@@ -163,101 +151,32 @@ impl ModelConfig {
         Ok(patches.map(|[rows, columns]| rows * columns).collect())
     }
 
-    /// Returns the number of encoder tokens of `num_views` context views: one per patch, or the latents of LVSM.
-    ///
-    /// # Errors
-    /// As [`num_patches`](Self::num_patches).
-    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
-        let num_patches = self.num_patches(num_views, height, width)?;
-        Ok(if self.has_latents() { self.num_latents } else { num_patches })
-    }
-
-    /// Whether the tokens of a scene are learned latents, which belong to no patch and no camera: they are neither clustered
-    /// nor condensed nor selected.
-    pub fn has_latents(&self) -> bool {
-        self.architecture == Architecture::LvsmEd
-    }
-
-    /// Whether linear layers and layer norms have biases.
-    pub(crate) fn has_biases(&self) -> bool {
-        !self.has_latents() || self.variant.is_released()
-    }
-
-    /// Whether the encoder reads colours in `[-1, 1]` instead of `[0, 1]`.
-    pub(crate) fn has_signed_colors(&self) -> bool {
-        self.has_latents() && !self.variant.is_released()
-    }
-
-    /// Whether the heads of queries and keys have norms.
-    pub(crate) fn has_query_key_norms(&self) -> bool {
-        self.variant.has_norms() || !self.has_biases()
-    }
-
     /// Whether the encoder's tokens have a norm.
     pub fn has_token_norm(&self) -> bool {
         self.variant.has_norms()
     }
 
-    /// Whether the condenser is that of the released code.
-    pub(crate) fn has_released_condenser(&self) -> bool {
-        !self.has_latents() && self.variant.is_released()
-    }
-
-    /// Checks every value against its range.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] with the key, the value and a valid value.
-    pub fn validate(&self) -> Result<(), ModelError> {
-        let bad = |key, value: String, fix| Err(ModelError::BadConfig { key, value, fix });
-        for (key, value, most) in [
-            ("model.dim", self.dim, 1 << 16),
-            ("model.num_heads", self.num_heads, 1 << 10),
-            ("model.feed_forward_dim", self.feed_forward_dim, 1 << 18),
-            ("model.num_encoder_blocks", self.num_encoder_blocks, 1 << 10),
-            ("model.num_renderer_blocks", self.num_renderer_blocks, 1 << 10),
-            ("model.patch_size", self.patch_size, 256),
-            ("model.num_latents", self.num_latents, 1 << 16),
-            ("model.condenser.num_blocks", self.condenser.num_blocks, 64),
-        ] {
-            let is_other = match key {
-                "model.num_latents" => !self.has_latents(),
-                "model.condenser.num_blocks" => self.has_latents(),
-                _ => false,
-            };
-            if is_other {
-                if value > 0 {
-                    let fix = format!("model.architecture = \"{}\" has none: leave the key out", self.architecture);
-                    return bad(key, value.to_string(), fix);
-                }
-                continue;
-            }
-            if value == 0 {
-                return bad(key, value.to_string(), "write at least 1".into());
-            }
-            if value > most {
-                return bad(key, value.to_string(), format!("write at most {most}"));
-            }
-        }
-        let Self { dim, num_heads, variant, .. } = *self;
+    /// Checks the values that all architectures have.
+    pub(crate) fn validate_sizes(&self) -> Result<(), ModelError> {
+        check_count("model.dim", self.dim, 1 << 16)?;
+        check_count("model.num_heads", self.num_heads, 1 << 10)?;
+        check_count("model.feed_forward_dim", self.feed_forward_dim, 1 << 18)?;
+        check_count("model.num_renderer_blocks", self.num_renderer_blocks, 1 << 10)?;
+        check_count("model.patch_size", self.patch_size, 256)?;
+        let Self { dim, num_heads, .. } = *self;
         if !dim.is_multiple_of(num_heads) {
             let fix = format!("write a divisor of model.dim = {dim}, such as {}", near_divisors(dim, num_heads));
-            return bad("model.num_heads", num_heads.to_string(), fix);
+            return bad("model.num_heads", num_heads, fix);
         }
-        if self.camera_encoding != CameraEncoding::Plucker {
-            let key = "model.camera_encoding";
-            let owner = match self.architecture {
-                Architecture::LvsmEd => Some("model.architecture = \"lvsm-ed\"".to_owned()),
-                Architecture::Clift => variant.is_released().then(|| format!("model.variant = \"{variant}\"")),
-            };
-            if let Some(owner) = owner {
-                let fix = format!("{owner} has \"plucker\": leave the key out");
-                return bad(key, self.camera_encoding.to_string(), fix);
-            }
-            if !(dim / num_heads).is_multiple_of(8) {
-                let fix =
-                    format!("needs heads of a multiple of 8 channels, not {}: change model.num_heads", dim / num_heads);
-                return bad(key, self.camera_encoding.to_string(), fix);
-            }
+        Ok(())
+    }
+
+    /// Checks camera-relative attention and patch grids.
+    pub(crate) fn validate_cameras(&self) -> Result<(), ModelError> {
+        let head_width = self.dim / self.num_heads;
+        if self.camera_encoding != CameraEncoding::Plucker && !head_width.is_multiple_of(8) {
+            let fix = format!("needs heads of a multiple of 8 channels, not {head_width}: change model.num_heads");
+            return bad("model.camera_encoding", self.camera_encoding, fix);
         }
         if self.patch_grids != PatchGrids::One {
             let reason = match (self.camera_encoding, self.patch_size) {
@@ -268,33 +187,32 @@ impl ModelConfig {
                 _ => None,
             };
             if let Some(reason) = reason {
-                let value = usize::from(self.patch_grids).to_string();
-                return bad("model.patch_grids", value, format!("{reason}: write 1"));
+                return bad("model.patch_grids", usize::from(self.patch_grids), format!("{reason}: write 1"));
             }
-        }
-        if self.has_latents() {
-            let fix = "of LVSM, write \"paper\" or \"released-re10k\", its network in CLiFT's release".to_owned();
-            return if variant.has_norms() { bad("model.variant", variant.to_string(), fix) } else { Ok(()) };
-        }
-        let CondenserConfig { num_blocks, residual, member_share } = self.condenser;
-        if variant.is_released() && num_blocks != 1 {
-            let fix = format!("model.variant = \"{variant}\" has one: leave the key out");
-            return bad("model.condenser.num_blocks", num_blocks.to_string(), fix);
-        }
-        if variant.is_released() && !residual {
-            let fix = format!("the block of model.variant = \"{variant}\" has residuals: leave the key out");
-            return bad("model.condenser.residual", residual.to_string(), fix);
-        }
-        if variant.is_released() && member_share {
-            let fix = format!("the block of model.variant = \"{variant}\" adds the whole update: leave the key out");
-            return bad("model.condenser.member_share", member_share.to_string(), fix);
         }
         Ok(())
     }
 }
 
-/// Latents of LVSM by default, as published.
-const LATENTS: usize = 3072;
+/// Returns the error of a key.
+pub(crate) fn bad(key: &'static str, value: impl Display, fix: String) -> Result<(), ModelError> {
+    Err(ModelError::BadConfig { key, value: value.to_string(), fix })
+}
+
+/// Checks that a count is at least 1 and at most `most`.
+pub(crate) fn check_count(key: &'static str, value: usize, most: usize) -> Result<(), ModelError> {
+    match value {
+        0 => bad(key, value, "write at least 1".into()),
+        _ if value > most => bad(key, value, format!("write at most {most}")),
+        _ => Ok(()),
+    }
+}
+
+/// Checks that a count of what the architecture lacks is 0.
+pub(crate) fn check_absent(key: &'static str, value: usize, config: &ModelConfig) -> Result<(), ModelError> {
+    let fix = || format!("model.architecture = \"{}\" has none: leave the key out", config.architecture);
+    if value > 0 { bad(key, value, fix()) } else { Ok(()) }
+}
 
 /// Returns the divisors of `number` next to `wrong` as text.
 fn near_divisors(number: usize, wrong: usize) -> String {

@@ -10,13 +10,26 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::network::config::ModelConfig;
+/// The parameters that the layers of a network have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LayerStyle {
+    /// Whether linear layers and layer norms have biases. Without them, matrices are normal.
+    pub has_biases: bool,
+    /// Whether the heads of queries and keys have norms.
+    pub has_query_key_norms: bool,
+}
+
+impl LayerStyle {
+    /// PyTorch's transformer layers.
+    pub const PYTORCH: Self = Self { has_biases: true, has_query_key_norms: false };
+}
 
 /// A source of initialized layers on a device. All layers share one stream of random numbers.
 #[derive(Debug)]
 pub struct Init {
     device: Device,
     rng: ChaCha8Rng,
+    style: LayerStyle,
     /// Standard deviation of LVSM's matrices, whose layers have no bias; `None` for PyTorch's distributions.
     deviation: Option<f64>,
 }
@@ -27,12 +40,26 @@ const DEVIATION: f64 = 0.02;
 impl Init {
     /// Starts the stream of `seed` for layers with biases.
     pub fn new(seed: u64, device: &Device) -> Self {
-        Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed), deviation: None }
+        Self::with_style(LayerStyle::PYTORCH, seed, device)
     }
 
-    /// Starts the stream of `seed` for the layers of a network.
-    pub fn of(config: &ModelConfig, seed: u64, device: &Device) -> Self {
-        Self { deviation: (!config.has_biases()).then_some(DEVIATION), ..Self::new(seed, device) }
+    /// Starts the stream of `seed` for layers of a style.
+    pub(crate) fn with_style(style: LayerStyle, seed: u64, device: &Device) -> Self {
+        let deviation = (!style.has_biases).then_some(DEVIATION);
+        Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed), style, deviation }
+    }
+
+    /// Makes layers without norms of queries and keys.
+    pub(crate) fn without_query_key_norms<T>(&mut self, make: impl FnOnce(&mut Self) -> T) -> T {
+        let former = std::mem::replace(&mut self.style.has_query_key_norms, false);
+        let layers = make(self);
+        self.style.has_query_key_norms = former;
+        layers
+    }
+
+    /// Whether the heads of queries and keys have norms.
+    pub(crate) fn has_query_key_norms(&self) -> bool {
+        self.style.has_query_key_norms
     }
 
     /// Starts a transformer block by its index, or the layers outside the blocks: LVSM's matrices get smaller with depth.

@@ -1,9 +1,11 @@
 //! The one description of the networks: every layer with its path, its sizes and the rows of its input.
 //!
 //! Parameter names and counts, multiply-accumulates, memory, largest tensors and published names are derived from this
-//! list. A new network adds one function that lists its layers.
+//! list. An architecture lists its layers in `Design::layers`.
 
+use crate::network::blocks::feed_forward::Activation;
 use crate::network::config::ModelConfig;
+use crate::network::init::LayerStyle;
 
 /// A layer of a network.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -71,8 +73,8 @@ pub enum LayerKind {
     Attention { width: usize, heads: usize, keys: Sequence },
     /// Softmax attention of every centroid to the keys of its cluster; each key belongs to one centroid.
     ClusterAttention { width: usize, keys: Sequence },
-    /// GELU or `ReLU` between the layers of a feed-forward network.
-    Activation { width: usize },
+    /// Activation between the layers of a feed-forward network.
+    Activation { width: usize, activation: Activation },
     /// Learned rows, beside the layer's input.
     Table { rows: usize, width: usize },
 }
@@ -98,132 +100,58 @@ impl Layer {
     }
 }
 
-impl ModelConfig {
-    /// Lists every layer in the order of published checkpoints: encoder, token norm, renderer, condenser; within a block
-    /// attention, feed-forward network, norms.
-    pub(crate) fn layers(&self) -> Vec<Layer> {
-        if self.has_latents() { lvsm_layers(self) } else { clift_layers(self) }
-    }
-}
-
-const CONTEXT: Sequence = &[Rows::ContextPatches];
-const MEMBERS: Sequence = &[Rows::Members];
-const STORED: Sequence = &[Rows::StoredTokens];
-const GATHERING: Sequence = &[Rows::GatheringTokens];
-const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
-const TARGETS: Sequence = &[Rows::TargetPatches];
-const LATENTS: Sequence = &[Rows::Latents];
-const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
-const TARGETS_AND_LATENTS: Sequence = &[Rows::TargetPatches, Rows::RenderTokens];
-
-fn lvsm_layers(config: &ModelConfig) -> Vec<Layer> {
-    let ModelConfig { dim, num_latents, .. } = *config;
-    let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
-
-    list.enter(Part::Encoder, None, "encoder");
-    list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
-    list.push("latents", LayerKind::Table { rows: num_latents, width: dim }, LATENTS_AND_CONTEXT, false);
-    // The last block of either network computes the rows that are read after it.
-    let num_blocks = config.num_encoder_blocks;
-    for i in 0..num_blocks {
-        list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
-        list.encoder_block(LATENTS_AND_CONTEXT, if i + 1 == num_blocks { LATENTS } else { LATENTS_AND_CONTEXT });
-    }
-
-    list.enter(Part::Renderer, None, "renderer");
-    list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
-    list.norm("joint.input_norm", if config.variant.is_released() { RENDER_TOKENS } else { TARGETS_AND_LATENTS });
-    let num_blocks = config.num_renderer_blocks;
-    for i in 0..num_blocks {
-        list.enter(Part::Renderer, Some(i), &format!("renderer.joint.blocks.{i}"));
-        list.encoder_block(TARGETS_AND_LATENTS, if i + 1 == num_blocks { TARGETS } else { TARGETS_AND_LATENTS });
-    }
-    list.enter(Part::Renderer, None, "renderer");
-    list.norm("output_norm", TARGETS);
-    list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
-    list.layers
-}
-
-fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
-    let dim = config.dim;
-    let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
-
-    list.enter(Part::Encoder, None, "encoder");
-    list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
-    for i in 0..config.num_encoder_blocks {
-        list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
-        list.encoder_block(CONTEXT, CONTEXT);
-    }
-    if config.has_token_norm() {
-        list.enter(Part::TokenNorm, None, "lift_norm");
-        list.norm("norm", CONTEXT);
-    }
-
-    list.enter(Part::Renderer, None, "renderer");
-    list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
-    for i in 0..config.num_renderer_blocks {
-        list.enter(Part::Renderer, Some(i), &format!("renderer.blocks.{i}"));
-        list.decoder_block(TARGETS, RENDER_TOKENS);
-    }
-    list.enter(Part::Renderer, None, "renderer");
-    list.norm("output_norm", TARGETS);
-    list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
-
-    if config.has_released_condenser() {
-        list.enter(Part::Condenser, Some(0), "condenser.released");
-        list.decoder_block(STORED, CONTEXT);
-        list.linear("gate", [dim, dim], STORED, true);
-        return list.layers;
-    }
-    let residual = config.condenser.residual;
-    for i in 0..config.condenser.num_blocks {
-        list.enter(Part::Condenser, Some(i), &format!("condenser.blocks.{i}"));
-        list.self_attention("self_attn", STORED, STORED);
-        list.norm("norm_self", STORED);
-        if residual {
-            list.norm("norm_cross", GATHERING);
-        }
-        // All blocks share one copy of the members.
-        list.push("norm_memory", LayerKind::LayerNorm { width: dim, bias: true }, MEMBERS, false);
-        list.norm("norm_ff", STORED);
-        list.cross_attention(GATHERING, !residual, MEMBERS);
-        list.feed_forward(STORED);
-        list.push("gate", LayerKind::Linear { inputs: dim, outputs: dim, bias: false }, STORED, true);
-    }
-    list.layers
-}
+// Sequences of the architectures' layers
+pub(crate) const CONTEXT: Sequence = &[Rows::ContextPatches];
+pub(crate) const MEMBERS: Sequence = &[Rows::Members];
+pub(crate) const STORED: Sequence = &[Rows::StoredTokens];
+pub(crate) const GATHERING: Sequence = &[Rows::GatheringTokens];
+pub(crate) const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
+pub(crate) const TARGETS: Sequence = &[Rows::TargetPatches];
+pub(crate) const LATENTS: Sequence = &[Rows::Latents];
+pub(crate) const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
+pub(crate) const TARGETS_AND_TOKENS: Sequence = &[Rows::TargetPatches, Rows::RenderTokens];
 
 /// The layers listed so far, and the network, block and path of the next ones.
-struct LayerList<'a> {
+pub(crate) struct LayerList<'a> {
     config: &'a ModelConfig,
+    /// The parameters of the next layers.
+    pub style: LayerStyle,
+    /// The activation of the next feed-forward networks.
+    pub activation: Activation,
     path: String,
     part: Part,
     block: Option<usize>,
-    layers: Vec<Layer>,
+    pub layers: Vec<Layer>,
 }
 
-impl LayerList<'_> {
-    fn enter(&mut self, part: Part, block: Option<usize>, path: &str) {
+impl<'a> LayerList<'a> {
+    pub fn new(config: &'a ModelConfig, style: LayerStyle) -> Self {
+        let activation = Activation::Gelu;
+        Self { config, style, activation, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() }
+    }
+
+    /// Starts the layers below a path, of a block or outside the blocks.
+    pub fn enter(&mut self, part: Part, block: Option<usize>, path: &str) {
         (self.part, self.block, self.path) = (part, block, path.to_owned());
     }
 
-    fn push(&mut self, name: &str, kind: LayerKind, rows: Sequence, saves_input: bool) {
+    pub fn push(&mut self, name: &str, kind: LayerKind, rows: Sequence, saves_input: bool) {
         let path = format!("{}.{name}", self.path);
         self.layers.push(Layer { path, part: self.part, block: self.block, kind, rows, saves_input });
     }
 
-    fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
-        let bias = self.config.has_biases();
+    pub fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
+        let bias = self.style.has_biases;
         self.push(name, LayerKind::Linear { inputs, outputs, bias }, rows, saves_input);
     }
 
-    fn norm(&mut self, name: &str, rows: Sequence) {
-        let bias = self.config.has_biases();
+    pub fn norm(&mut self, name: &str, rows: Sequence) {
+        let bias = self.style.has_biases;
         self.push(name, LayerKind::LayerNorm { width: self.config.dim, bias }, rows, true);
     }
 
     /// Adds self-attention of the first rows, `queries`, to all after a norm, with one packed projection.
-    fn self_attention(&mut self, name: &str, rows: Sequence, queries: Sequence) {
+    pub fn self_attention(&mut self, name: &str, rows: Sequence, queries: Sequence) {
         let ModelConfig { dim, num_heads, .. } = *self.config;
         self.linear(&format!("{name}.in_proj"), [dim, 3 * dim], rows, false);
         self.push(name, LayerKind::Attention { width: dim, heads: num_heads, keys: rows }, queries, true);
@@ -231,7 +159,7 @@ impl LayerList<'_> {
     }
 
     /// Adds cross-attention: in the condenser to the tokens of a cluster, in the renderer to all.
-    fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
+    pub fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
         let ModelConfig { dim: width, num_heads: heads, .. } = *self.config;
         let (name, kind) = match self.part {
             Part::Condenser => ("cluster_attn", LayerKind::ClusterAttention { width, keys }),
@@ -246,7 +174,7 @@ impl LayerList<'_> {
     fn attention_output(&mut self, name: &str, rows: Sequence, keys: Sequence) {
         let ModelConfig { dim, num_heads: heads, .. } = *self.config;
         self.linear(&format!("{name}.out_proj"), [dim, dim], rows, true);
-        if self.config.has_query_key_norms() && self.part != Part::Condenser {
+        if self.style.has_query_key_norms && self.part != Part::Condenser {
             let norm = LayerKind::HeadNorm { width: dim / heads, heads };
             self.push(&format!("{name}.qk_norm.query"), norm, rows, true);
             self.push(&format!("{name}.qk_norm.key"), norm, keys, true);
@@ -254,15 +182,15 @@ impl LayerList<'_> {
     }
 
     /// Adds the two layers of a feed-forward network.
-    fn feed_forward(&mut self, rows: Sequence) {
+    pub fn feed_forward(&mut self, rows: Sequence) {
         let ModelConfig { dim, feed_forward_dim: hidden, .. } = *self.config;
         self.linear("feed_forward.up", [dim, hidden], rows, false);
-        self.push("feed_forward", LayerKind::Activation { width: hidden }, rows, true);
+        self.push("feed_forward", LayerKind::Activation { width: hidden, activation: self.activation }, rows, true);
         self.linear("feed_forward.down", [hidden, dim], rows, false);
     }
 
     /// Adds PyTorch's pre-norm encoder layer, which computes the first rows, `outputs`.
-    fn encoder_block(&mut self, rows: Sequence, outputs: Sequence) {
+    pub fn encoder_block(&mut self, rows: Sequence, outputs: Sequence) {
         self.self_attention("attn", rows, outputs);
         self.feed_forward(outputs);
         self.norm("norm_attn", rows);
@@ -270,13 +198,20 @@ impl LayerList<'_> {
     }
 
     /// Adds PyTorch's pre-norm decoder layer.
-    fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
+    pub fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
         self.self_attention("self_attn", rows, rows);
         self.cross_attention(rows, false, keys);
         self.feed_forward(rows);
         for name in ["norm_self", "norm_cross", "norm_ff"] {
             self.norm(name, rows);
         }
+    }
+
+    /// Adds the norm and the projection that decode images at the end of a renderer.
+    pub fn output_head(&mut self) {
+        self.enter(Part::Renderer, None, "renderer");
+        self.norm("output_norm", TARGETS);
+        self.linear("to_pixels", [self.config.dim, self.config.rgb_patch_len()], TARGETS, false);
     }
 }
 
@@ -289,7 +224,7 @@ mod tests {
 
     use super::*;
     use crate::cost::parameters::Parameters;
-    use crate::network::clift::Clift;
+    use crate::network::model::Clift;
     use crate::testing::small_configs;
     use crate::weights::file::save_weights;
 
@@ -312,7 +247,7 @@ mod tests {
                 [encoder, lift_norm, condenser, renderer, total].map(|count| count as usize),
                 [
                     model.encoder.num_params(),
-                    model.lift_norm.num_params(),
+                    model.lift_norm.as_ref().map_or(0, Module::num_params),
                     model.condenser.num_params(),
                     model.renderer.num_params(),
                     model.num_params(),

@@ -6,26 +6,57 @@ use crate::network::blocks::block::DecoderBlock;
 use crate::network::camera_encoding::upload_ids;
 use crate::network::tokens::Tokens;
 
-/// Keys and values of a scene's tokens in every block of a renderer; the tokens themselves for LVSM's, which mixes them with
-/// the patches of every view.
+/// What the blocks of a renderer read of a scene, the same for all of its views.
 #[derive(Clone, Debug)]
-pub struct KeyValueCache {
-    /// One tensor per block, `[batch, num_render_tokens, 2 dim]`.
-    pub(crate) blocks: Vec<Tensor<3>>,
-    pub(crate) tokens: Option<RenderTokens>,
-    pub(crate) num_render_tokens: usize,
+#[expect(clippy::large_enum_variant, reason = "a scene has one cache")]
+pub enum KeyValueCache {
+    /// The tokens themselves.
+    Tokens(RenderTokens),
+    /// Keys and values of the tokens.
+    Projected {
+        /// One tensor per block, `[batch, num_tokens, 2 dim]`.
+        blocks: Vec<Tensor<3>>,
+        /// Number of tokens.
+        num_tokens: usize,
+    },
 }
 
 impl KeyValueCache {
-    /// Returns the keys and values of some tokens, given by their indices.
+    /// Returns the number of tokens of every set.
+    pub fn num_tokens(&self) -> usize {
+        match self {
+            Self::Tokens(tokens) => tokens.num_tokens(),
+            Self::Projected { num_tokens, .. } => *num_tokens,
+        }
+    }
+
+    /// Returns the tokens of every set, `[groups, num_tokens, dim]`.
+    ///
+    /// # Panics
+    /// For projected tokens.
+    pub(crate) fn sets(&self) -> Tensor<3> {
+        match self {
+            Self::Tokens(tokens) => tokens.sets(),
+            Self::Projected { .. } => panic!("the renderer reads tokens, not their keys and values"),
+        }
+    }
+
+    /// Selects the same tokens of every scene, given by their indices.
+    ///
+    /// # Panics
+    /// If every target view has its own tokens.
     #[must_use]
-    pub fn select(&self, tokens: &[u32]) -> Self {
-        let Some(first) = self.blocks.first() else {
-            return self.clone();
-        };
-        let indices = upload_ids(tokens, &first.device());
-        let blocks = self.blocks.iter().map(|key_value| key_value.clone().select(1, indices.clone())).collect();
-        Self { blocks, tokens: None, num_render_tokens: tokens.len() }
+    pub fn select(&self, ids: &[u32]) -> Self {
+        match self {
+            Self::Tokens(RenderTokens { tokens, rows }) => {
+                assert!(rows.is_none(), "one set of tokens per scene");
+                Self::Tokens(tokens.select(ids).into())
+            }
+            Self::Projected { blocks, .. } => {
+                let select = |key_value: &Tensor<3>| key_value.clone().select(1, upload_ids(ids, &key_value.device()));
+                Self::Projected { blocks: blocks.iter().map(select).collect(), num_tokens: ids.len() }
+            }
+        }
     }
 }
 
@@ -37,10 +68,10 @@ pub struct RenderTokens {
     rows: Option<Tensor<2, Int>>,
 }
 
-impl<T: Into<Tokens>> From<T> for RenderTokens {
+impl From<Tokens> for RenderTokens {
     /// Takes one set per scene, `[batch, num_render_tokens, dim]`, or per target view, `[batch * views, ..]`.
-    fn from(tokens: T) -> Self {
-        Self { tokens: tokens.into(), rows: None }
+    fn from(tokens: Tokens) -> Self {
+        Self { tokens, rows: None }
     }
 }
 
@@ -50,8 +81,7 @@ impl RenderTokens {
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_tokens, dim]`
-    pub fn subsets(tokens: impl Into<Tokens>, subsets: &[Vec<Vec<u32>>]) -> Self {
-        let tokens = tokens.into();
+    pub fn subsets(tokens: Tokens, subsets: &[Vec<Vec<u32>>]) -> Self {
         let [batch, num_tokens, _dim] = tokens.dims();
         let groups: usize = subsets.iter().map(Vec::len).sum();
         let rows: Vec<i64> = subsets
@@ -86,8 +116,13 @@ impl RenderTokens {
     }
 
     /// Returns the number of tokens of every set.
-    pub(crate) fn num_render_tokens(&self) -> usize {
+    pub(crate) fn num_tokens(&self) -> usize {
         self.rows.as_ref().map_or(self.tokens.dims()[1], |rows| rows.dims()[1])
+    }
+
+    /// Whether the tokens have the transforms of camera-relative attention.
+    pub(crate) fn has_transforms(&self) -> bool {
+        self.tokens.transforms.is_some()
     }
 
     /// Returns the tokens of every set, `[groups, num_render_tokens, dim]`.

@@ -14,14 +14,15 @@ pub struct Tokens {
     pub transforms: Option<TokenTransforms>,
 }
 
-impl From<Tensor<3>> for Tokens {
-    /// Takes tokens of a network without camera-relative attention.
-    fn from(values: Tensor<3>) -> Self {
+impl Tokens {
+    /// Takes the tokens of a network without camera-relative attention.
+    ///
+    /// # Shapes
+    /// - `values`: `[batch, num_tokens, dim]`
+    pub fn without_cameras(values: Tensor<3>) -> Self {
         Self { values, transforms: None }
     }
-}
 
-impl Tokens {
     /// Returns `[batch, num_tokens, dim]`.
     pub fn dims(&self) -> [usize; 3] {
         self.values.dims()

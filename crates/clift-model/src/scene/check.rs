@@ -64,14 +64,17 @@ impl Scene {
 
     fn check_tokens(&self, num_patches: usize) -> Result<(), String> {
         let (count, dim) = (self.num_tokens(), self.model.dim);
-        if self.model.has_latents() != (self.kind == TokenKind::Latents) {
+        if self.model.architecture.supports_clusters() == (self.kind == TokenKind::All) {
             return Err(format!("{} tokens of a network of {}", self.kind, self.model.architecture));
         }
-        if self.model.has_latents() && !self.token_ids.iter().copied().eq(0..self.model.num_latents as u32) {
-            return Err(format!("{count} tokens, expected all {} latents in order", self.model.num_latents));
-        }
-        // The places of latents are their indices.
-        let num_patches = if self.model.has_latents() { count } else { num_patches };
+        // The places of learned tokens are their indices.
+        let num_patches = match self.model.num_learned_tokens() {
+            Some(all) if !self.token_ids.iter().copied().eq(0..all as u32) => {
+                return Err(format!("{count} tokens, expected all {all} learned tokens in order"));
+            }
+            Some(all) => all,
+            None => num_patches,
+        };
         if !(1..=num_patches).contains(&count) {
             return Err(format!("{count} tokens, expected 1 to {num_patches}, the number of patches"));
         }

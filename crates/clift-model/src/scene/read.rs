@@ -124,16 +124,16 @@ fn from_bytes(
         context: cameras.map(|(&c2w, &intrinsics)| ViewCamera { c2w, intrinsics }).collect(),
         context_frames: tensors.u32s("context_frames", &[views])?,
         world: SceneNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
-        token_ids: if model.has_latents() {
-            (0..num_tokens as u32).collect()
-        } else {
+        token_ids: if model.has_patch_tokens() {
             tensors.u32s("token_ids", &[num_tokens])?
+        } else {
+            (0..num_tokens as u32).collect()
         },
         tokens,
         model,
     };
     scene.check()?;
-    if !scene.model.has_latents() {
+    if scene.model.has_patch_tokens() {
         check_rays(&scene, &tensors.f32s("token_rays", &[num_tokens, 6])?)?;
     }
     Ok((scene, format.into()))
@@ -176,12 +176,12 @@ impl Tensors<'_> {
         let dtype = self.view("tokens")?.dtype();
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));
         let format = format.ok_or_else(|| format!("`tokens` is {dtype:?}, expected F32, F16 or I8"))?;
-        let places = if model.has_latents() { 0 } else { 2 };
+        let places = if model.has_patch_tokens() { 2 } else { 0 };
         let expected = 6 + places + usize::from(format == TokenFormat::Int8);
         if self.0.len() != expected {
             return Err(format!("{} tensors, expected {expected}", self.0.len()));
         }
-        let count = if model.has_latents() { model.num_latents } else { self.length("token_ids")? };
+        let count = model.num_learned_tokens().map_or_else(|| self.length("token_ids"), Ok)?;
         let scales = if format == TokenFormat::Int8 { self.f32s("token_scales", &[count])? } else { Vec::new() };
         if let Some(token) = scales.iter().position(|scale| !(scale.is_finite() && *scale >= 0.0)) {
             return Err(format!("scale {} of token {token}, expected a finite number", scales[token]));

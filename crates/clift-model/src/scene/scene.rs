@@ -10,10 +10,10 @@
 //! | `context_c2w`: normalized poses, camera to world | F64 | `[views, 4, 4]` |
 //! | `context_intrinsics`: `fx, fy, cx, cy` in pixels | F64 | `[views, 4]` |
 //! | `world_mean_c2w`, `world_scale`: the normalization of poses | F64 | `[4, 4]`, `[1]` |
-//! | `token_rays`: `[moment, direction]` through the center of a token's patch, not of latents | F32 | `[tokens, 6]` |
+//! | `token_rays`: `[moment, direction]` through the center of a token's patch, not of learned tokens | F32 | `[tokens, 6]` |
 //! | `token_scales`, with `int8` tokens only | F32 | `[tokens]` |
 //! | `context_frames`: frame number of each view in the capture | U32 | `[views]` |
-//! | `token_ids`: patch of the context views of each token, not of latents | U32 | `[tokens]` |
+//! | `token_ids`: patch of the context views of each token, not of learned tokens | U32 | `[tokens]` |
 //! | `tokens` | F32, F16 or I8 | `[tokens, dim]` |
 //!
 //! `__metadata__` holds strings: `format` = `clift-scene`, `version`, `key` of the scene, `kind` of its tokens, `model`
@@ -69,8 +69,8 @@ pub struct Scene {
     pub context_frames: Vec<u32>,
     /// Normalization of the poses.
     pub world: SceneNormalization,
-    /// Patch of each token, `[S]`: `view * rows * columns + row * columns + column`; its index in LVSM, whose files do not
-    /// store it.
+    /// Patch of each token, `[S]`: `view * rows * columns + row * columns + column`; its index if
+    /// tokens are learned, whose files do not store it.
     pub token_ids: Vec<u32>,
     /// Values of the tokens after rounding, `[S, D]`.
     pub tokens: Vec<f32>,
@@ -82,12 +82,12 @@ impl Scene {
         self.token_ids.len()
     }
 
-    /// Returns the ray of every token, through the center of its patch; none of latents.
+    /// Returns the ray of every token, through the center of its patch; none of learned tokens.
     ///
     /// # Shapes
     /// - returns `[num_tokens]`, or `[0]`
     pub fn token_rays(&self) -> Vec<TokenRay> {
-        let ids = if self.model.has_latents() { &[] } else { &self.token_ids[..] };
+        let ids = if self.model.has_patch_tokens() { &self.token_ids[..] } else { &[] };
         TokenRay::of_patches(ids, &self.context, self.height, self.width, self.model.patch_size)
     }
 
@@ -107,14 +107,14 @@ impl Scene {
 }
 
 /// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + S (28 + D b)` for V context views and S tokens of
-/// width D with b bytes per value, and four more bytes per token for `int8`. Latents of LVSM have neither ray nor patch, 28
-/// bytes less.
+/// width D with b bytes per value, and four more bytes per token for `int8`. Learned tokens have neither ray nor
+/// patch, 28 bytes less.
 pub fn scene_file_bytes(model: &ModelConfig, num_tokens: usize, num_views: usize, format: TokenFormat) -> u64 {
     // Pose and intrinsics in f64, and a frame number.
     let view = (16 + 4) * 8 + 4;
     let world = (16 + 1) * 8;
     // A ray of six f32, and the index of a patch.
-    let place = if model.has_latents() { 0 } else { 6 * 4 + 4 };
+    let place = if model.has_patch_tokens() { 6 * 4 + 4 } else { 0 };
     let token = place + format.bytes_per_token(model.dim);
     (8 + HEADER_BYTES + world + num_views * view + num_tokens * token) as u64
 }

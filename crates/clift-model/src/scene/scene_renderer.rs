@@ -10,8 +10,8 @@ use crate::cost::memory::render_bytes;
 use crate::error::ModelError;
 use crate::network::camera_encoding::TransformMaker;
 use crate::network::config::ModelConfig;
+use crate::network::parts::renderer::Renderer;
 use crate::network::render_tokens::KeyValueCache;
-use crate::network::renderer::Renderer;
 use crate::network::tokens::Tokens;
 use crate::scene::scene::Scene;
 use crate::tokens::selection::rules::SelectionRules;
@@ -77,6 +77,8 @@ pub struct SceneRenderer {
     /// Keys and values of all storage tokens.
     cache: KeyValueCache,
     selector: Selector,
+    /// Whether tokens have rays, by which a view selects them.
+    has_patch_tokens: bool,
     /// Rows of the images that the network was trained on.
     trained_height: usize,
     device: Device,
@@ -96,12 +98,13 @@ impl SceneRenderer {
         let tokens = Tokens { values, transforms };
         let selector = Selector::new(rules, &scene.token_rays())?;
         let cache = renderer.project_tokens(tokens);
-        Ok(Self { renderer, cache, selector, trained_height: scene.height, device: device.clone() })
+        let (has_patch_tokens, trained_height) = (scene.model.has_patch_tokens(), scene.height);
+        Ok(Self { renderer, cache, selector, has_patch_tokens, trained_height, device: device.clone() })
     }
 
     /// Returns the number of the scene's tokens.
     pub fn num_storage_tokens(&self) -> usize {
-        self.cache.num_render_tokens
+        self.cache.num_tokens()
     }
 
     /// Returns the number of frames of `width` by `height` pixels that one call renders.
@@ -131,7 +134,7 @@ impl SceneRenderer {
     ///
     /// # Errors
     /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, and for
-    /// fewer latents of LVSM than all,
+    /// fewer learned tokens than all,
     /// [`ModelError::Device`] if an image cannot be read from the device.
     ///
     /// # Panics
@@ -144,9 +147,9 @@ impl SceneRenderer {
         num_render_tokens: usize,
     ) -> Result<Vec<RenderedView>, ModelError> {
         let mut rendered = Vec::with_capacity(views.len());
-        if num_render_tokens < self.num_storage_tokens() && self.renderer.is_joint() {
+        if num_render_tokens < self.num_storage_tokens() && !self.has_patch_tokens {
             let fix = format!(
-                "the latents of lvsm-ed belong to no view, so that none can be selected by the camera: render from all {}",
+                "learned tokens belong to no view, so that none can be selected by the camera: render from all {}",
                 self.num_storage_tokens()
             );
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: num_render_tokens.to_string(), fix });
@@ -197,7 +200,7 @@ impl SceneRenderer {
 mod tests {
     use super::*;
     use crate::network::architecture::CameraEncoding;
-    use crate::network::clift::Clift;
+    use crate::network::model::Clift;
     use crate::scene::scene::tests::{camera, scene};
     use crate::testing::devices;
     use crate::tokens::selection::rules::SelectionPreset;

@@ -86,7 +86,7 @@ impl Scene {
             ("world_mean_c2w", "F64", vec![4, 4], f64_bytes(&mut self.world.mean_c2w.into_iter())),
             ("world_scale", "F64", vec![1], f64_bytes(&mut [self.world.scale].into_iter())),
         ];
-        let has_places = !self.model.has_latents();
+        let has_places = self.model.has_patch_tokens();
         if has_places {
             tensors.push(("token_rays", "F32", vec![count, 6], f32_bytes(&rays)));
         }

@@ -1,4 +1,4 @@
-//! Condensed tokens, K-means tokens or latents.
+//! Condensed tokens, K-means tokens or all tokens.
 
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -10,8 +10,8 @@ pub enum TokenKind {
     Clift,
     /// The tokens nearest to the K-means centers, rendered with the renderer of stage 1.
     Kmeans,
-    /// All latents of LVSM, which has one stage.
-    Latents,
+    /// All tokens of a network without clusters, which has one stage.
+    All,
 }
 
 impl TokenKind {

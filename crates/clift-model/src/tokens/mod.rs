@@ -1,7 +1,7 @@
 //! Counts, groups and subsets of tokens.
 //!
 //! - `count`: a number or share of tokens
-//! - `kind`: condensed tokens, K-means tokens or latents
+//! - `kind`: condensed tokens, K-means tokens or all tokens
 //! - `clusters`: the cluster of every token, on the host and on a device
 //! - `grouping`: the choice of the groups
 //! - `kmeans`: latent K-means, the grouping of the paper

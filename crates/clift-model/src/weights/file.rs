@@ -244,7 +244,7 @@ mod tests {
 
     use super::*;
     use crate::network::architecture::CliftVariant;
-    use crate::network::clift::Clift;
+    use crate::network::model::Clift;
     use crate::testing::small_config;
     use crate::weights::hash::weights_hash;
 

@@ -4,8 +4,9 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
+use crate::network::architecture::CameraEncoding;
 use crate::network::config::ModelConfig;
-use crate::network::renderer::Renderer;
+use crate::network::parts::renderer::Renderer;
 
 /// Hashes paths, shapes and values of all parameters of a module; returns 64 hexadecimal digits. Equal weights have equal
 /// hashes on every device.
@@ -25,7 +26,12 @@ pub fn weights_hash<M: Module>(module: &M) -> String {
 /// shapes do not determine.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, camera_encoding, .. } = config;
-    hex::encode(Sha256::digest(format!("{variant} {num_heads} {camera_encoding} {}", weights_hash(renderer))))
+    // The paper's encoding is not named: the hashes are part of scene files.
+    let encoding = match camera_encoding {
+        CameraEncoding::Plucker => String::new(),
+        other => format!("{other} "),
+    };
+    hex::encode(Sha256::digest(format!("{variant} {num_heads} {encoding}{}", weights_hash(renderer))))
 }
 
 /// Calls `f` with path, shape and values of every parameter, in the module's order.

@@ -73,7 +73,7 @@ const WEIGHTS: &str = "model.safetensors";
 fn weights_of(run: &Path, kind: TokenKind) -> PathBuf {
     let stage = match kind {
         TokenKind::Clift => "stage2",
-        TokenKind::Kmeans | TokenKind::Latents => "stage1",
+        TokenKind::Kmeans | TokenKind::All => "stage1",
     };
     run.join(stage).join(WEIGHTS)
 }

@@ -8,10 +8,10 @@ use burn::tensor::Device;
 
 use crate::cost::parameters::Parameters;
 use crate::error::ModelError;
-use crate::network::clift::{Clift, is_condenser};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
-use crate::network::renderer::Renderer;
+use crate::network::model::{Clift, is_condenser};
+use crate::network::parts::renderer::Renderer;
 use crate::weights::file::{load_module, load_part};
 use crate::weights::hash::{renderer_hash, weights_hash};
 use crate::weights::model_path::{ModelPath, check_condenser, check_sizes};

@@ -16,7 +16,7 @@ use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
 use crate::config::config::{ClustersConfig, Config};
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
-use crate::events::{Event, Sink, Stage};
+use crate::events::{Event, RunStep, Sink};
 
 /// Inputs of the cluster cache of a run.
 pub struct ClusterBuilder<'a> {
@@ -53,7 +53,7 @@ impl ClusterBuilder<'_> {
         let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
         let total_sets = (config.clusters.num_passes * num_scenes) as u64;
         let started = std::time::Instant::now();
-        sink.event(&Event::StageStarted { stage: Stage::Clusters, done, num_steps: total_sets });
+        sink.event(&Event::StepStarted { run_step: RunStep::Clusters, done, num_steps: total_sets });
         let of_set = |set: u64| (set / num_scenes as u64, set as usize % num_scenes);
         for first in (done..total_sets).step_by(ranks.num_ranks()) {
             let set = first + ranks.rank() as u64;
@@ -74,13 +74,13 @@ impl ClusterBuilder<'_> {
                         }
                     }
                 }
-                sink.event(&Event::Progress { stage: Stage::Clusters, done: set + 1, total: total_sets });
+                sink.event(&Event::Progress { run_step: RunStep::Clusters, done: set + 1, total: total_sets });
             }
             if is_stopped {
                 return Err(TrainError::Interrupted { step: total_sets.min(first + ranks.num_ranks() as u64) });
             }
         }
-        sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
+        sink.event(&Event::StepFinished { run_step: RunStep::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
         ranks.from_root(|| log.take().map_or(Ok(()), |log| log.publish(folder, num_scenes)))?;
         ClusterCache::open(folder, config, encoder_hash)
     }

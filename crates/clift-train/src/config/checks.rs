@@ -55,8 +55,9 @@ impl Config {
             check_config(is_valid, "stage1.keep_tokens", format!("[{low}, {high}]"), || fix.into())
         };
         keep_tokens(low > 0.0 && low <= high && high <= 1.0, "write 0 < smallest <= largest <= 1")?;
-        let all_latents = "the decoder of model.architecture = \"lvsm-ed\" reads all latents: write [1.0, 1.0]";
-        keep_tokens(!self.model.has_latents() || low == 1.0, all_latents)?;
+        let architecture = self.model.architecture;
+        let all_tokens = format!("model.architecture = \"{architecture}\" renders from all tokens: write [1.0, 1.0]");
+        keep_tokens(architecture.supports_clusters() || low == 1.0, &all_tokens)?;
         let (half, share) = (stage1.half_resolution, 0.0..=1.0);
         let (tolerance, factor, weight) =
             (clusters.kmeans.tolerance, stage2.renderer_lr_factor, stage2.weight_interpolation);

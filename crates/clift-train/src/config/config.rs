@@ -8,7 +8,7 @@ use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCou
 use serde::{Deserialize, Serialize};
 
 use crate::error::{TrainError, bad};
-use crate::events::Stage;
+use crate::events::{RunStep, Stage};
 
 /// Most tokens of a scene: ids are stored in 16 bits.
 pub const MAX_TOKENS: usize = 1 << 16;
@@ -58,9 +58,10 @@ pub struct Config {
 }
 
 impl Config {
-    /// Returns the stages of a run in their order: a network without condenser has one.
+    /// Returns the stages of a run in their order: a network without clusters has one.
     pub fn stages(&self) -> &'static [Stage] {
-        if self.model.has_latents() { &[Stage::Stage1] } else { &[Stage::Stage1, Stage::Clusters, Stage::Stage2] }
+        let has_stage2 = self.model.architecture.supports_clusters();
+        if has_stage2 { &[Stage::Stage1, Stage::Stage2] } else { &[Stage::Stage1] }
     }
 
     /// Returns the step of stage 1 whose gaps between contexts stage 2 has: the last one, or the last of the warm-up of the
@@ -70,14 +71,25 @@ impl Config {
         if self.stage1.steps == 0 { warm_up_steps } else { self.stage1.steps.min(warm_up_steps) }
     }
 
-    /// Returns the stages of a run and its evaluation.
-    pub fn parts(&self) -> Vec<Stage> {
-        [self.stages(), &[Stage::Eval]].concat()
+    /// Returns the steps of a run in their order.
+    pub fn run_steps(&self) -> &'static [RunStep] {
+        const STAGE_1: RunStep = RunStep::Train(Stage::Stage1);
+        const STAGE_2: RunStep = RunStep::Train(Stage::Stage2);
+        if self.model.architecture.supports_clusters() {
+            &[STAGE_1, RunStep::Clusters, STAGE_2, RunStep::Eval]
+        } else {
+            &[STAGE_1, RunStep::Eval]
+        }
     }
 
-    /// Returns the token counts of stored scenes in an evaluation: those of `eval`, or all latents.
+    /// Returns the token counts of stored scenes in an evaluation: those of `eval`, or all tokens of a network without
+    /// clusters.
     pub fn eval_stored_tokens(&self) -> Vec<TokenCount> {
-        if self.model.has_latents() { vec![TokenCount::Share(1.0)] } else { self.eval.stored_tokens.clone() }
+        if self.model.architecture.supports_clusters() {
+            self.eval.stored_tokens.clone()
+        } else {
+            vec![TokenCount::Share(1.0)]
+        }
     }
 
     /// Returns the settings of an evaluation, without LPIPS and external methods.

@@ -5,7 +5,7 @@ use clift_model::{Grouping, Part, SceneSizes, kmeans_values, largest_tensors, ma
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
-use crate::events::Stage;
+use crate::events::{RunStep, Stage};
 use crate::footprint::scene_sizes::{
     VIEWS_PER_PASS, cluster_counts, kept, largest_sizes, scene_with_all_tokens, scene_with_stored_tokens,
 };
@@ -19,35 +19,35 @@ const VGG_CHANNELS: u64 = 64;
 /// A tensor of a run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LargestTensor {
-    /// Part of the run.
-    pub part: Stage,
+    /// Step of the run.
+    pub run_step: RunStep,
     /// Description of the tensor.
     pub what: String,
     /// Size in bytes.
     pub bytes: u64,
 }
 
-/// Returns the largest tensor of a part of a run, at the most views and tokens that can be sampled.
+/// Returns the largest tensor of a step of a run, at the most views and tokens that can be sampled.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for impossible sizes.
-pub fn largest_tensor(config: &Config, part: Stage) -> Result<LargestTensor, TrainError> {
-    let all = tensors(config, part)?;
-    let (what, values) = all.into_iter().max_by_key(|(_, values)| *values).expect("every part has tensors");
-    Ok(LargestTensor { part, what, bytes: values * F32 })
+pub fn largest_tensor(config: &Config, run_step: RunStep) -> Result<LargestTensor, TrainError> {
+    let all = tensors(config, run_step)?;
+    let (what, values) = all.into_iter().max_by_key(|(_, values)| *values).expect("every step has tensors");
+    Ok(LargestTensor { run_step, what, bytes: values * F32 })
 }
 
 /// Refuses a run with a tensor that the open device cannot hold.
-pub fn check_tensors(config: &Config, device: &Device, parts: &[Stage]) -> Result<(), TrainError> {
-    max_tensor_bytes(device).map_or(Ok(()), |limit| check_tensor_limit(config, limit, parts))
+pub fn check_tensors(config: &Config, device: &Device, run_steps: &[RunStep]) -> Result<(), TrainError> {
+    max_tensor_bytes(device).map_or(Ok(()), |limit| check_tensor_limit(config, limit, run_steps))
 }
 
-fn check_tensor_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), TrainError> {
-    for &part in parts {
-        let LargestTensor { what, bytes, .. } = largest_tensor(config, part)?;
+fn check_tensor_limit(config: &Config, limit: u64, run_steps: &[RunStep]) -> Result<(), TrainError> {
+    for &run_step in run_steps {
+        let LargestTensor { what, bytes, .. } = largest_tensor(config, run_step)?;
         if bytes > limit {
-            let (key, value, fix) = largest_fitting_setting(config, part, limit)?;
-            let of = if part == Stage::Eval { "the evaluation".into() } else { part.name().to_owned() };
+            let (key, value, fix) = largest_fitting_setting(config, run_step, limit)?;
+            let of = if run_step == RunStep::Eval { "the evaluation" } else { run_step.name() };
             let fix = format!(
                 "{what} of {of} would be one tensor of {bytes} bytes, and {} takes at most {limit} in one: {fix}",
                 config.device
@@ -59,32 +59,37 @@ fn check_tensor_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<()
 }
 
 /// Returns the key to change, its value, and the largest value that fits.
-fn largest_fitting_setting(config: &Config, part: Stage, limit: u64) -> Result<(String, String, String), TrainError> {
-    let fits = |config: &Config| Ok::<_, TrainError>(largest_tensor(config, part)?.bytes <= limit);
+fn largest_fitting_setting(
+    config: &Config,
+    run_step: RunStep,
+    limit: u64,
+) -> Result<(String, String, String), TrainError> {
+    let fits = |config: &Config| Ok::<_, TrainError>(largest_tensor(config, run_step)?.bytes <= limit);
     let mut smaller = config.clone();
     let set_views = |config: &mut Config, count: usize| {
-        if part == Stage::Eval {
+        if run_step == RunStep::Eval {
             config.eval.num_context = count;
             return;
         }
         config.data.views.max_context = count;
         config.data.views.min_context = config.data.views.min_context.min(count);
     };
-    let StageSettings { batch_size, accumulate, .. } = config.stage(part);
-    let is_trained = !part.trained().is_empty();
-    if is_trained {
+    let mut also = String::new();
+    if let RunStep::Train(stage) = run_step {
+        let StageSettings { batch_size, accumulate, .. } = config.stage(stage);
+        let key = format!("{}.accumulate", stage.name());
         for parts in accumulate..=batch_size {
-            smaller.set_accumulate(part, parts);
+            smaller.set_accumulate(stage, parts);
             if fits(&smaller)? {
-                return Ok((format!("{}.accumulate", part.name()), accumulate.to_string(), format!("write {parts}")));
+                return Ok((key, accumulate.to_string(), format!("write {parts}")));
             }
         }
+        also = format!(" with {key} = {batch_size}");
     }
-    let (key, now) = match part {
-        Stage::Eval => ("eval.num_context", config.eval.num_context),
+    let (key, now) = match run_step {
+        RunStep::Eval => ("eval.num_context", config.eval.num_context),
         _ => ("data.views.max_context", config.data.views.max_context),
     };
-    let also = if is_trained { format!(" with {}.accumulate = {batch_size}", part.name()) } else { String::new() };
     for count in (1..now).rev() {
         set_views(&mut smaller, count);
         if fits(&smaller)? {
@@ -95,23 +100,25 @@ fn largest_fitting_setting(config: &Config, part: Stage, limit: u64) -> Result<(
     Ok(("data.width, data.height".into(), size, "even one view does not fit: choose smaller images".into()))
 }
 
-/// Lists the tensors that can be the largest of a part, with their numbers of values.
-fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainError> {
+/// Lists the tensors that can be the largest of a step, with their numbers of values.
+fn tensors(config: &Config, run_step: RunStep) -> Result<Vec<(String, u64)>, TrainError> {
     let (eval, views) = (&config.eval, &config.data.views);
-    let (num_context, num_targets) = match part {
-        Stage::Eval => (eval.num_context, eval.num_targets.clamp(1, VIEWS_PER_PASS)),
+    let (num_context, num_targets) = match run_step {
+        RunStep::Eval => (eval.num_context, eval.num_targets.clamp(1, VIEWS_PER_PASS)),
         _ => (views.max_context, views.num_targets),
     };
     let scene = scene_with_all_tokens(config, num_context, num_targets)?;
-    let num_scenes = config.stage(part).micro_batch_size();
+    let stage = if let RunStep::Train(stage) = run_step { Some(stage) } else { None };
+    let num_scenes = stage.map_or(1, |stage| config.stage(stage).micro_batch_size());
     let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
     let mut all = of(Part::Encoder, &scene);
-    let counts = match part {
-        _ if config.model.has_latents() => Vec::new(),
-        Stage::Stage1 => Vec::new(),
-        Stage::Stage2 | Stage::Clusters => cluster_counts(config, scene.num_tokens)?,
+    let supports_clusters = config.model.architecture.supports_clusters();
+    let counts = match run_step {
+        _ if !supports_clusters => Vec::new(),
+        RunStep::Train(Stage::Stage1) => Vec::new(),
+        RunStep::Train(Stage::Stage2) | RunStep::Clusters => cluster_counts(config, scene.num_tokens)?,
         // An evaluation index may have other numbers of contexts.
-        Stage::Eval => eval
+        RunStep::Eval => eval
             .stored_tokens
             .iter()
             .map(|count| count.of(scene.num_tokens))
@@ -119,27 +126,28 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
             .unwrap_or_default(),
     };
     let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
-    if config.model.has_latents() {
+    if !supports_clusters {
         all.extend(of(Part::Renderer, &scene));
-    } else if part == Stage::Eval || part == Stage::Clusters && config.clusters.grouping == Grouping::Kmeans {
+    } else if run_step == RunStep::Eval || run_step == RunStep::Clusters && config.clusters.grouping == Grouping::Kmeans
+    {
         all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
     }
-    if matches!(part, Stage::Stage2 | Stage::Eval) && !config.model.has_latents() {
+    if matches!(run_step, RunStep::Train(Stage::Stage2) | RunStep::Eval) && supports_clusters {
         all.extend(of(Part::Condenser, &scene_with_stored_tokens(scene, most)));
         all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }
-    if part == Stage::Stage1 {
-        all.extend(of(Part::Renderer, &largest_sizes(config, part)?));
+    if stage == Some(Stage::Stage1) {
+        all.extend(of(Part::Renderer, &largest_sizes(config, Stage::Stage1)?));
         // Views share the tokens of the steps in which all are kept.
         if kept(scene, config.stage1.keep_tokens[1]) == scene {
             all.extend(of(Part::Renderer, &scene));
         }
     }
     let first_maps = (num_scenes * num_targets * config.data.width * config.data.height) as u64 * VGG_CHANNELS;
-    if !part.trained().is_empty() && config.loss.perceptual_weight > 0.0 {
+    if stage.is_some() && config.loss.perceptual_weight > 0.0 {
         all.push(("the first maps of the perceptual loss".into(), first_maps));
     }
-    if part == Stage::Eval && eval.lpips_path().is_some() {
+    if run_step == RunStep::Eval && eval.lpips_path().is_some() {
         all.push(("the first maps of LPIPS".into(), first_maps));
     }
     Ok(all)
@@ -159,8 +167,8 @@ mod tests {
         config
     }
 
-    fn largest(config: &Config, part: Stage) -> (String, u64) {
-        let LargestTensor { what, bytes, .. } = largest_tensor(config, part).expect("valid");
+    fn largest(config: &Config, run_step: impl Into<RunStep>) -> (String, u64) {
+        let LargestTensor { what, bytes, .. } = largest_tensor(config, run_step.into()).expect("valid");
         (what, bytes)
     }
 
@@ -189,21 +197,21 @@ mod tests {
         let scores = 8 * 6144 * (MAX_SCORES as u64 / (8 * 6144)) * 4;
         assert_eq!(largest(&config, Stage::Stage2).1, scores);
         // A table of 6,144^2 distances.
-        assert_eq!(largest(&config, Stage::Clusters), ("the distances of K-means".into(), 6144 * 6144 * 4));
+        assert_eq!(largest(&config, RunStep::Clusters), ("the distances of K-means".into(), 6144 * 6144 * 4));
         config.data.views.max_context = 9;
         // 9,216^2 are more than a table may have: distances to 9,216 clusters.
-        assert_eq!(largest(&config, Stage::Clusters), ("the distances of K-means".into(), 9216 * 9216 * 4));
+        assert_eq!(largest(&config, RunStep::Clusters), ("the distances of K-means".into(), 9216 * 9216 * 4));
         config.eval.num_context = 1;
         config.eval.num_targets = 100;
         // Eight views at a time: 8 x 1,024 x 3 x 768.
-        assert_eq!(largest(&config, Stage::Eval).1, 8 * 1024 * 3 * 768 * 4);
+        assert_eq!(largest(&config, RunStep::Eval).1, 8 * 1024 * 3 * 768 * 4);
     }
 
     #[test]
     fn refusal_names_the_micro_batch_that_fits() {
         let config = paper();
         let limit = (1 << 31) - 4;
-        let message = check_tensor_limit(&config, limit, &config.parts()).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, limit, config.run_steps()).unwrap_err().to_string();
         // 64 scenes x 6 views at once; of 9 scenes it is 2.04e9 bytes, so 8 parts fit.
         let bytes = 64_u64 * 6 * 6143 * 2 * 768 * 4;
         let expected = format!(
@@ -213,9 +221,9 @@ mod tests {
         assert_eq!(message, expected);
         let mut fitting = config.clone();
         fitting.stage1.accumulate = 8;
-        check_tensor_limit(&fitting, limit, &[Stage::Stage1]).expect("the value of the message");
+        check_tensor_limit(&fitting, limit, &[Stage::Stage1.into()]).expect("the value of the message");
         fitting.stage1.accumulate = 7;
-        assert!(check_tensor_limit(&fitting, limit, &[Stage::Stage1]).is_err(), "and no less");
+        assert!(check_tensor_limit(&fitting, limit, &[Stage::Stage1.into()]).is_err(), "and no less");
     }
 
     #[test]
@@ -224,11 +232,11 @@ mod tests {
         config.stage1.accumulate = 64;
         // 6 x 5,119 x 2 x 768 values of five contexts.
         let limit = 6 * 5119 * 2 * 768 * 4;
-        let message = check_tensor_limit(&config, limit, &[Stage::Stage1]).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, limit, &[Stage::Stage1.into()]).unwrap_err().to_string();
         assert!(message.starts_with("`data.views.max_context` = 6:"), "{message}");
         assert!(message.ends_with("write 5 with stage1.accumulate = 64, or choose smaller images"), "{message}");
-        let message = check_tensor_limit(&config, 1000, &[Stage::Eval]).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, 1000, &[RunStep::Eval]).unwrap_err().to_string();
         assert!(message.starts_with("`data.width, data.height` = 256, 256:"), "{message}");
-        check_tensors(&config, &Device::flex(), &config.parts()).expect("memory alone is a CPU's limit");
+        check_tensors(&config, &Device::flex(), config.run_steps()).expect("memory alone is a CPU's limit");
     }
 }

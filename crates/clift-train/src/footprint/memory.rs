@@ -5,57 +5,58 @@ use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, inference_by
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::events::Stage;
+use crate::events::{RunStep, Stage};
 use crate::footprint::scene_sizes::{
     VIEWS_PER_PASS, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips, num_patches, num_tokens,
+    scene_with_all_tokens,
 };
 
 /// Memory of a process besides its tensors: code, threads and buffers (docs/guide/training.md).
 const PROCESS_BYTES: u64 = 20 << 20;
 
-/// Returns the peak memory of the process during a part of a run.
+/// Returns the peak memory of the process during a step of a run.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for impossible sizes.
-pub fn peak_bytes(config: &Config, part: Stage) -> Result<u64, TrainError> {
-    let bytes = match part {
-        Stage::Stage1 | Stage::Stage2 => update(config, part)?,
-        Stage::Clusters => inference_bytes(&config.model, &clusters(config)?),
-        Stage::Eval => inference_bytes(&config.model, &evaluation(config)?),
+pub fn peak_bytes(config: &Config, run_step: RunStep) -> Result<u64, TrainError> {
+    let bytes = match run_step {
+        RunStep::Train(stage) => update(config, stage)?,
+        RunStep::Clusters => inference_bytes(&config.model, &clusters(config)?),
+        RunStep::Eval => inference_bytes(&config.model, &evaluation(config)?),
     };
     Ok(PROCESS_BYTES + bytes as u64)
 }
 
-/// Describes the part of a run that exceeds the `available` memory the most, with a change of the config that fits;
-/// `None` if all parts fit or the available memory is unknown.
+/// Describes the step of a run that exceeds the `available` memory the most, with a change of the config that fits;
+/// `None` if all steps fit or the available memory is unknown.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for impossible sizes.
 pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<String>, TrainError> {
     let Some(available) = available else { return Ok(None) };
     let mut largest = None;
-    for part in config.parts() {
-        let bytes = peak_bytes(config, part)?;
+    for &run_step in config.run_steps() {
+        let bytes = peak_bytes(config, run_step)?;
         if bytes > available && largest.is_none_or(|(_, most)| bytes >= most) {
-            largest = Some((part, bytes));
+            largest = Some((run_step, bytes));
         }
     }
-    let Some((part, bytes)) = largest else { return Ok(None) };
-    let name = part.name();
+    let Some((run_step, bytes)) = largest else { return Ok(None) };
+    let name = run_step.name();
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let device = config.device;
     let needs =
         format!("{name} needs about {:.1} GiB, and {device} has {:.1} GiB available", gib(bytes), gib(available));
-    if part.trained().is_empty() {
+    let RunStep::Train(stage) = run_step else {
         return Ok(Some(format!("{needs}: fewer context views, or smaller ones, would fit")));
-    }
+    };
     let was_on = config.activation_checkpointing;
     for activation_checkpointing in [config.activation_checkpointing, true] {
         let mut config = Config { activation_checkpointing, ..config.clone() };
         let also = if activation_checkpointing && !was_on { "activation_checkpointing = true and " } else { "" };
-        for parts in 1..=config.stage(part).batch_size {
-            config.set_accumulate(part, parts);
-            if peak_bytes(&config, part)? <= available {
+        for parts in 1..=config.stage(stage).batch_size {
+            config.set_accumulate(stage, parts);
+            if peak_bytes(&config, run_step)? <= available {
                 return Ok(Some(format!("{needs}: {also}{name}.accumulate = {parts} would fit")));
             }
         }
@@ -101,6 +102,7 @@ fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
     Ok(InferenceSizes {
         num_parameters: parameters.total,
         num_loaded: parameters.encoder + parameters.renderer,
+        num_encoder_rows: most,
         num_tokens: most,
         num_clusters: cluster_counts(config, most)?.last().copied(),
         num_targets: 0,
@@ -116,19 +118,19 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let parameters = Parameters::of(&config.model);
     let all = num_tokens(config, eval.num_context)?;
     let stored = config.eval_stored_tokens().iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
-    let has_latents = config.model.has_latents();
-    // LVSM encodes its latents beside the patches, and has no second stage.
-    let encoded = if has_latents { all + num_patches(config, eval.num_context)? } else { all };
-    let second_renderer = if has_latents { 0 } else { parameters.renderer };
+    let supports_clusters = config.model.architecture.supports_clusters();
+    let second_renderer = if supports_clusters { parameters.renderer } else { 0 };
+    let scene = scene_with_all_tokens(config, eval.num_context, 0)?;
     let sweep = eval_sizes(config);
     let num_rendered: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {
-        // Each stage has a renderer.
+        // Each of two stages has a renderer.
         num_parameters: parameters.total + second_renderer,
         num_loaded: parameters.condenser + parameters.renderer,
-        num_tokens: encoded,
-        num_clusters: stored.iter().max().copied().filter(|_| !has_latents),
+        num_encoder_rows: scene.num_encoder_rows(&config.model),
+        num_tokens: all,
+        num_clusters: stored.iter().max().copied().filter(|_| supports_clusters),
         num_targets: eval.num_targets.min(VIEWS_PER_PASS),
         num_patches: num_patches(config, 1)?,
         // Images of every count and method are kept until the metrics of the scene are computed.
@@ -152,7 +154,7 @@ mod tests {
         let mut config = Config { run_dir: "run".into(), ..Config::default() };
         (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
         config.data.views.max_context = 4;
-        let peak = |config: &Config, stage: Stage| peak_bytes(config, stage).expect("valid");
+        let peak = |config: &Config, stage: Stage| peak_bytes(config, stage.into()).expect("valid");
         let warning = |available: u64| memory_warning(&config, Some(available)).expect("valid");
         assert_eq!(warning(u64::MAX), None);
         assert_eq!(memory_warning(&config, None).expect("valid"), None);

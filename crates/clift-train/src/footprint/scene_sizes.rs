@@ -47,8 +47,9 @@ pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainE
 
 /// Returns the settings of an evaluation: the methods of the config, or those for which a run has weights.
 pub fn eval_sizes(config: &Config) -> Sweep {
-    if config.model.has_latents() {
-        return config.sweep(config.eval_stored_tokens(), vec![Method::LvsmEd]);
+    let architecture = config.model.architecture;
+    if !architecture.supports_clusters() {
+        return config.sweep(config.eval_stored_tokens(), vec![Method::Whole(architecture)]);
     }
     let condensed = Method::condensed(config.clusters.grouping);
     let mut methods = config.eval.methods.clone();

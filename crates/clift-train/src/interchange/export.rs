@@ -45,8 +45,8 @@ pub struct Exported {
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] if `out` exists, or if there are no published keys: of networks with camera-relative attention, of
-/// LVSM, and of condensers with `member_share`; [`TrainError::BadFile`] if the weight file does not fit the config, and those of
-/// reading and writing.
+/// other architectures than `CLiFT`, and of condensers with `member_share`; [`TrainError::BadFile`] if the weight file does not
+/// fit the config, and those of reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
     match format {
         ExportFormat::F16 => export_f16(config, model, out),
@@ -74,7 +74,7 @@ fn export_published(
         require_absent(&codecs[1])?;
     }
     config.model.validate()?;
-    if config.model.has_latents() {
+    if !config.model.architecture.supports_export() {
         let fix =
             "the formats are those of CLiFT's checkpoints, which have no names for this network: write --format f16";
         return Err(bad("model.architecture", format!("\"{}\"", config.model.architecture), fix));

@@ -80,8 +80,8 @@ pub(crate) fn open_stage2(config: &Config, stage1: &TrainedModel) -> Result<Trai
     if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
 }
 
-/// Opens the model of a run of LVSM, for an evaluation of the run of `evaluated` with those of `others`.
-pub(crate) fn open_lvsm(
+/// Opens the model of a run of a network without clusters, for an evaluation of the run of `evaluated` with those of `others`.
+pub(crate) fn open_whole(
     evaluated: &Config,
     config: &Config,
     others: &[TrainedModel],
@@ -94,8 +94,9 @@ pub(crate) fn open_lvsm(
             "it was trained on images of another size or crop, or on other poses: choose a run with the same [data]",
         );
     }
-    if others.iter().any(|other| other.config.num_latents == config.model.num_latents) {
-        return refuse("another run of LVSM has as many latents: choose runs with distinct model.num_latents");
+    let kind = |model: &ModelConfig| (model.architecture, model.num_latents);
+    if others.iter().any(|other| kind(&other.config) == kind(&config.model)) {
+        return refuse("another run of this network has as many latents: choose runs with distinct model.num_latents");
     }
     let found = weights(config, Stage::Stage1, "the weights of stage 1")?;
     // All methods are drawn on as many patch grids.

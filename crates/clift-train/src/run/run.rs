@@ -23,11 +23,11 @@ use crate::distributed::machine::open_device;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
-use crate::events::{Event, Sink, Stage};
+use crate::events::{Event, RunStep, Sink, Stage};
 use crate::fit_token_codec::ensure_codec;
 use crate::footprint::largest_tensor;
 use crate::run::eval_folder::{EvalFolder, SUMMARY, read_finished};
-use crate::run::evaluate_model::{open_lvsm, open_stage2};
+use crate::run::evaluate_model::{open_stage2, open_whole};
 use crate::run::init_from::{init_from, stage2_weights};
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
@@ -83,11 +83,13 @@ impl Run {
         }
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
-        if let Some(only) = options.only.filter(|only| !config.stages().contains(only)) {
-            let fix = "a network of model.architecture = \"lvsm-ed\" has one stage: write stage1, or leave --only out";
+        if let Some(only) = options.only.filter(|only| !config.run_steps().contains(only)) {
+            let architecture = config.model.architecture;
+            let fix =
+                format!("model.architecture = \"{architecture}\" has one stage: write stage1, or leave --only out");
             return Err(bad("--only", only.name(), fix));
         }
-        largest_tensor::check_tensors(&config, &device, &config.parts())?;
+        largest_tensor::check_tensors(&config, &device, config.run_steps())?;
         // Missing weights are reported now, not after days of training.
         config.loss.weights()?;
         if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
@@ -128,12 +130,12 @@ impl Run {
     /// [`TrainError::Missing`] if `only` is a stage whose predecessor has not run, and those of the stages.
     pub fn train(
         &self,
-        only: Option<Stage>,
+        only: Option<RunStep>,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Option<Summary>, TrainError> {
         let stages = self.config.stages();
-        let wanted = |stage: Stage| stages.contains(&stage) && only.is_none_or(|only| only == stage);
+        let wanted = |stage: Stage| stages.contains(&stage) && only.is_none_or(|only| only == stage.into());
         let summary = self.folder("eval").join(SUMMARY);
         // Rank 0 looks at the files for all.
         let has_weights = || Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists()));
@@ -166,7 +168,7 @@ impl Run {
         } else {
             self.load_stage1(only)?
         };
-        if only == Some(Stage::Clusters) || train_stage2 {
+        if only == Some(RunStep::Clusters) || train_stage2 {
             let cache = self.clusters(only, &reader, &stage1, stop, sink)?;
             if train_stage2 {
                 self.train_stage2(&reader, cache, &validation, stage1, stop, sink)?;
@@ -189,7 +191,8 @@ impl Run {
     }
 
     /// Evaluates the run. `beside` are other runs, evaluated on the same views: one with the same stage 1 whose stage 2 was
-    /// trained on other groups of tokens, and runs of LVSM with distinct numbers of latents.
+    /// trained on other groups of tokens, and runs of networks without clusters, with distinct numbers of
+    /// tokens.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] if stage 2 was trained on another
@@ -206,8 +209,8 @@ impl Run {
         let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::EvaluatedRun, sink)).transpose()?;
         let mut models = self.models(sink)?;
         for other in beside {
-            if other.model.has_latents() {
-                models.lvsm.push(open_lvsm(&self.config, other, &models.lvsm, &self.device)?);
+            if !other.model.architecture.supports_clusters() {
+                models.whole.push(open_whole(&self.config, other, &models.whole, &self.device)?);
                 continue;
             }
             if other.clusters.grouping == self.config.clusters.grouping {
@@ -222,7 +225,7 @@ impl Run {
 
     /// Opens the trained models of both stages, or of stage 1 only.
     fn models(&self, sink: &mut dyn Sink) -> Result<EvalModels, TrainError> {
-        let weights = self.require_stage1(Stage::Eval)?;
+        let weights = self.require_stage1(RunStep::Eval)?;
         let path = ModelPath { dir: self.config.run_dir.clone(), weights };
         let mut models = EvalModels::new(TrainedModel::open(&path, &self.config.model, &self.device)?);
         if self.weights(Stage::Stage2).exists() {
@@ -313,7 +316,7 @@ impl Run {
 
     fn clusters(
         &self,
-        only: Option<Stage>,
+        only: Option<RunStep>,
         reader: &ClipReader,
         model: &Clift,
         stop: &AtomicBool,
@@ -331,7 +334,7 @@ impl Run {
         if is_built {
             return ClusterCache::open(&folder, &self.config, encoder_hash);
         }
-        if only == Some(Stage::Stage2) {
+        if only == Some(RunStep::Train(Stage::Stage2)) {
             let what = "the cluster cache";
             return Err(TrainError::Missing { stage: "stage2", what, first: "--only clusters", path: folder });
         }
@@ -344,21 +347,21 @@ impl Run {
         Clift::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
     }
 
-    fn load_stage1(&self, only: Option<Stage>) -> Result<Clift, TrainError> {
-        let path = self.require_stage1(only.unwrap_or(Stage::Stage2))?;
+    fn load_stage1(&self, only: Option<RunStep>) -> Result<Clift, TrainError> {
+        let path = self.require_stage1(only.unwrap_or(Stage::Stage2.into()))?;
         let mut model = self.new_model();
         load_part(&mut model, &Clift::stage1_part(), &path)?.require_all(&path)?;
         Ok(model)
     }
 
-    /// Returns the path of the stage-1 weights, which `stage` needs.
-    fn require_stage1(&self, stage: Stage) -> Result<PathBuf, TrainError> {
+    /// Returns the path of the stage-1 weights, which `step` needs.
+    fn require_stage1(&self, step: RunStep) -> Result<PathBuf, TrainError> {
         let path = self.weights(Stage::Stage1);
         if path.exists() {
             return Ok(path);
         }
         let what = "the weights of stage 1";
-        Err(TrainError::Missing { stage: stage.name(), what, first: "--only stage1", path })
+        Err(TrainError::Missing { stage: step.name(), what, first: "--only stage1", path })
     }
 
     /// Reports that a data set is opened: the first time, thousands of files are read.

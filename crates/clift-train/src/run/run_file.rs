@@ -9,13 +9,13 @@ use serde_json::Value;
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
-use crate::events::{Event, Sink, Stage};
+use crate::events::{Event, RunStep, Sink, Stage};
 use crate::run::extend::{ExtensionRecord, StepExtension};
 use crate::run::lock::{LockedFolder, RunLock, has_other_files};
 use crate::version::check_version;
 
 const FILE: &str = "run.json";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Keys that may change when a run is resumed.
 const FREE_KEYS: [&str; 9] = [
@@ -67,8 +67,8 @@ impl RunFile {
 /// Options of a run beside its config.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RunOptions {
-    /// Run only this stage.
-    pub only: Option<Stage>,
+    /// Run only this step.
+    pub only: Option<RunStep>,
     /// Train and evaluate on this number of training scenes.
     pub overfit: Option<usize>,
     /// Start a new run; the existing run directory is renamed.
@@ -77,8 +77,8 @@ pub struct RunOptions {
     pub extend: bool,
 }
 
-/// Parts of a run with a folder.
-const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
+/// Steps of training, each of which has a folder.
+const TRAINING_STEPS: [RunStep; 3] = [RunStep::Train(Stage::Stage1), RunStep::Clusters, RunStep::Train(Stage::Stage2)];
 
 /// Locks the run directory of a config, new or existing, and writes the resolved config to it. Returns the lock.
 ///
@@ -87,7 +87,7 @@ const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
 /// [`TrainError::Io`].
 pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<RunLock, TrainError> {
     let folder = &config.run_dir;
-    if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
+    if options.fresh && !matches!(options.only, None | Some(RunStep::Train(Stage::Stage1))) {
         return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
     }
     let is_run = folder.join(FILE).exists();
@@ -106,7 +106,7 @@ pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn 
     let lock = RunLock::take(folder, LockedFolder::Run, sink)?;
     remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
     // A run that failed before its first stage may get other settings.
-    let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
+    let has_begun = TRAINING_STEPS.iter().any(|step| folder.join(step.name()).exists());
     let (mut file, mut extended) = (RunFile::new(options.overfit), Vec::<ExtensionRecord>::new());
     let written = folder.join("config.toml");
     if has_begun && !written.exists() {

@@ -79,11 +79,11 @@ impl StagePlan<'_> {
         for line in parts_notes(self.parts, ranks) {
             log.event(&Event::Message(line));
         }
-        log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
+        log.event(&Event::StepStarted { run_step: stage.into(), done: progress.step, num_steps });
 
         let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
         let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
-        training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
+        training.log.event(&Event::StepFinished { run_step: stage.into(), elapsed_s: started.elapsed().as_secs_f64() });
         Ok(model)
     }
 }

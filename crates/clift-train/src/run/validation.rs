@@ -16,7 +16,7 @@ use clift_model::{Clift, TokenCoding, TokenCount, TrainedModel};
 use crate::config::config::Config;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
-use crate::events::{EvalEvents, Event, Sink, Stage};
+use crate::events::{EvalEvents, Event, RunStep, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::run::eval_folder::EvalFolder;
 use crate::run::training_curves::training_curves;
@@ -51,7 +51,7 @@ impl<'a> Validation<'a> {
         device: &Device,
         sink: &mut dyn Sink,
     ) -> Result<Self, TrainError> {
-        largest_tensor::check_tensors(config, device, &[Stage::Eval])?;
+        largest_tensor::check_tensors(config, device, &[RunStep::Eval])?;
         let run_dir = &config.run_dir;
         let description = RunDescription {
             name: run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned(),
@@ -106,7 +106,9 @@ impl<'a> Validation<'a> {
             models.set_stage2(clusters.grouping, model);
             (eval.validation_stored_tokens, Method::condensed(clusters.grouping))
         } else {
-            (TokenCount::Share(1.0), if sizes.has_latents() { Method::LvsmEd } else { Method::Kmeans })
+            let architecture = sizes.architecture;
+            let method = if architecture.supports_clusters() { Method::Kmeans } else { Method::Whole(architecture) };
+            (TokenCount::Share(1.0), method)
         };
         let all = &self.evaluator.sweep;
         let sweep = Sweep {
@@ -151,7 +153,7 @@ impl<'a> Validation<'a> {
         let training = training_curves(&self.config.run_dir);
         let summary =
             self.evaluator.evaluate(models, request.external, training, request.folder.path(), &mut progress)?;
-        sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
+        sink.event(&Event::StepFinished { run_step: RunStep::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }
 }

@@ -31,7 +31,6 @@ impl Stage {
         match self {
             Self::Stage1 => &[Part::Encoder, Part::TokenNorm, Part::Renderer],
             Self::Stage2 => &[Part::Condenser, Part::TokenNorm, Part::Renderer],
-            Self::Clusters | Self::Eval => &[],
         }
     }
 }
@@ -81,7 +80,7 @@ impl Stage1Config {
 }
 
 impl Config {
-    /// Returns the settings of a stage. The cluster cache and the evaluation have no steps and no trained network.
+    /// Returns the settings of a stage.
     pub fn stage(&self, stage: Stage) -> StageSettings<'_> {
         let Self { stage1, stage2, .. } = self;
         let settings = StageSettings {
@@ -105,18 +104,14 @@ impl Config {
                 renderer_lr_factor: stage2.renderer_lr_factor,
                 ..settings
             },
-            Stage::Clusters | Stage::Eval => {
-                StageSettings { steps: 0, half_resolution_steps: 0, batch_size: 1, accumulate: 1, ..settings }
-            }
         }
     }
 
-    /// Sets the number of micro-batches per update of a training stage.
+    /// Sets the number of micro-batches per update of a stage.
     pub fn set_accumulate(&mut self, stage: Stage, parts: usize) {
         match stage {
             Stage::Stage1 => self.stage1.accumulate = parts,
             Stage::Stage2 => self.stage2.accumulate = parts,
-            Stage::Clusters | Stage::Eval => {}
         }
     }
 }

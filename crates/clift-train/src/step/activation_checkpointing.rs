@@ -1,13 +1,12 @@
-//! Activation checkpointing: a backward pass that stores only the input of every block and recomputes the rest.
+//! Activation checkpointing: a backward pass that stores only the values between blocks and recomputes the rest.
 //!
 //! Memory per block is one input instead of all activations, for one more forward pass. The gradients equal those of the
 //! plain backward: the same operations on the same values.
-// B scenes, N tokens, T target views, Q patches of a view, D width
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
-use clift_model::{Cameras, Clift, Tokens, Views};
+use clift_model::{Clift, PassState};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -24,110 +23,69 @@ pub(crate) fn backward(
     accumulator: &mut GradientsAccumulator<Clift>,
 ) -> Result<LossParts, TrainError> {
     let mut add = |grads: Gradients| accumulator.accumulate(model, GradientsParams::from_grads(grads, model));
-    let plain = model.valid();
+    let token_step = batch_tokens.step();
 
-    // Forward without autodiff: the inputs of the blocks.
-    let context = Views {
-        images: device_batch.context.images.clone().inner(),
-        cameras: untracked(&device_batch.context.cameras),
-    };
-    let targets = untracked(&device_batch.targets);
-    let context_transforms = plain.encoder.transforms(&context.cameras);
-    let target_transforms = plain.renderer.transforms(&targets);
-    let (encoder_inputs, encoded) =
-        block_inputs(plain.encoder.embed(&context), plain.encoder.num_blocks(), |block, x| {
-            plain.encoder.block(block, x, context_transforms.as_ref())
-        });
-    let lift = Tokens { values: encoded, transforms: context_transforms };
-    let tokens = batch_tokens.apply(&plain.condenser, plain.normalize(lift.clone()))?;
-    let (renderer_inputs, x) =
-        block_inputs(plain.renderer.embed(&tokens, &targets), plain.renderer.num_blocks(), |block, x| {
-            plain.renderer.block(block, x, &tokens, target_transforms.as_ref())
-        });
+    // Forward without autodiff: the values between the blocks.
+    let (plain_model, plain_batch) = (model.valid(), device_batch.untracked());
+    let plain = plain_batch.pass(&plain_model, &token_step);
+    let mut inputs = vec![PassState::default()];
+    for index in 0..plain.num_blocks() {
+        inputs.push(plain.block(index, inputs[index].clone())?);
+    }
+    drop(plain);
 
     // Backward, one block after the other.
-    let x = leaf(x);
-    let parts = loss.of(model.renderer.to_image(x.clone(), &device_batch.targets), device_batch.target_images.clone());
+    let pass = device_batch.pass(model, &token_step);
+    let last = leaf(inputs.pop().expect("the first input"));
+    let parts = loss.of(pass.to_image(last.clone()), device_batch.target_images.clone());
     let mut grads = parts.total.clone().mul_scalar(share).backward();
     let parts = LossParts { total: parts.total.inner(), mse: parts.mse.inner() };
-    let mut grad_x = take_gradient(&x, &mut grads);
+    let mut gradient = StateGradient::take(&last, &mut grads);
     add(grads);
-
-    let mut grad_tokens: Option<Tensor<3>> = None;
-    // A renderer reads the tokens in every block, or before the first.
-    let mut add_grad_tokens = |tokens: &Tensor<3>, grads: &mut Gradients| {
-        let Some(grad) = tokens.grad_remove(grads) else { return };
-        grad_tokens = Some(match grad_tokens.take() {
-            Some(sum) => sum + grad,
-            None => grad,
-        });
-    };
-    let target_transforms = model.renderer.transforms(&device_batch.targets);
-    for (block, input) in renderer_inputs.into_iter().enumerate().rev() {
-        let (x, block_tokens) = (leaf(input), leaf(tokens.values().clone()));
-        let tokens = tokens.with_values(block_tokens.clone());
-        let output = model.renderer.block(block, x.clone(), &tokens, target_transforms.as_ref());
-        let mut grads = backward_from(output, grad_x);
-        grad_x = take_gradient(&x, &mut grads);
-        add_grad_tokens(&block_tokens, &mut grads);
+    let first = if trains(&model.encoder) { 0 } else { pass.num_encoder_blocks() };
+    while inputs.len() > first {
+        let input = leaf(inputs.pop().expect("one input per block"));
+        let output = pass.block(inputs.len(), input.clone())?;
+        let Some(sum) = gradient.weighted_sum(output) else { break };
+        let mut grads = sum.backward();
+        gradient = StateGradient::take(&input, &mut grads);
         add(grads);
     }
-    let embedded_tokens = leaf(tokens.values().clone());
-    let embedded = model.renderer.embed(&tokens.with_values(embedded_tokens.clone()), &device_batch.targets);
-    let mut grads = backward_from(embedded, grad_x);
-    add_grad_tokens(&embedded_tokens, &mut grads);
-    add(grads);
-    let Some(grad_tokens) = grad_tokens else {
-        return Ok(parts); // a renderer without blocks reads no token
-    };
-
-    let encoded = leaf(lift.values.clone());
-    let lift = lift.with_values(encoded.clone());
-    let output = batch_tokens.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
-    let mut grads = backward_from(output, grad_tokens);
-    let mut grad_x = take_gradient(&encoded, &mut grads);
-    add(grads);
-    if !trains(&model.encoder) {
-        return Ok(parts);
-    }
-    for (block, input) in encoder_inputs.into_iter().enumerate().rev() {
-        let x = leaf(input);
-        let mut grads = backward_from(model.encoder.block(block, x.clone(), lift.transforms.as_ref()), grad_x);
-        grad_x = take_gradient(&x, &mut grads);
-        add(grads);
-    }
-    add(backward_from(model.encoder.embed(&device_batch.context), grad_x));
     Ok(parts)
 }
 
-fn untracked(cameras: &Cameras) -> Cameras {
-    Cameras { c2w: cameras.c2w.clone().inner(), intrinsics: cameras.intrinsics.clone().inner(), ..*cameras }
+/// Gradients of the loss by the values between two blocks.
+struct StateGradient {
+    x: Option<Tensor<3>>,
+    tokens: Option<Tensor<3>>,
 }
 
-/// Returns the inputs of all blocks, and the output of the last.
-fn block_inputs(
-    first: Tensor<3>,
-    num_blocks: usize,
-    forward: impl Fn(usize, Tensor<3>) -> Tensor<3>,
-) -> (Vec<Tensor<3>>, Tensor<3>) {
-    let mut inputs = vec![first];
-    for block in 0..num_blocks {
-        inputs.push(forward(block, inputs[inputs.len() - 1].clone()));
+impl StateGradient {
+    fn take(leaf: &PassState, grads: &mut Gradients) -> Self {
+        let mut take = |leaf: &Tensor<3>| leaf.grad_remove(grads);
+        Self {
+            x: leaf.x.as_ref().and_then(&mut take),
+            tokens: leaf.tokens.as_ref().and_then(|tokens| take(tokens.values())),
+        }
     }
-    let last = inputs.pop().expect("the first input");
-    (inputs, last)
+
+    /// Returns a scalar whose gradient by `values` is this one; `None` without a gradient.
+    fn weighted_sum(self, values: PassState) -> Option<Tensor<1>> {
+        let weighted = |value: Tensor<3>, gradient: Tensor<3>| (value * gradient.autodiff()).sum();
+        let x = values.x.zip(self.x).map(|(x, gradient)| weighted(x, gradient));
+        let tokens = values.tokens.zip(self.tokens);
+        let tokens = tokens.map(|(tokens, gradient)| weighted(tokens.values().clone(), gradient));
+        x.into_iter().chain(tokens).reduce(|sum, term| sum + term)
+    }
 }
 
-fn leaf(x: Tensor<3>) -> Tensor<3> {
-    x.autodiff().require_grad()
-}
-
-fn backward_from(output: Tensor<3>, grad: Tensor<3>) -> Gradients {
-    (output * grad.autodiff()).sum().backward()
-}
-
-fn take_gradient(leaf: &Tensor<3>, grads: &mut Gradients) -> Tensor<3> {
-    leaf.grad_remove(grads).unwrap_or_else(|| leaf.clone().inner().zeros_like())
+/// Returns the same values as leaves of a graph.
+fn leaf(state: PassState) -> PassState {
+    let leaf = |x: Tensor<3>| x.autodiff().require_grad();
+    PassState {
+        x: state.x.map(leaf),
+        tokens: state.tokens.map(|tokens| tokens.with_values(leaf(tokens.values().clone()))),
+    }
 }
 
 fn trains<M: Module>(module: &M) -> bool {
@@ -224,12 +182,14 @@ mod tests {
             ..of(variant)
         });
         for network in CliftVariant::ALL.map(of).iter().chain(&relative).chain(&lvsm) {
-            for (stage, batch) in cases.iter().filter(|(stage, _)| *stage == Stage::Stage1 || !network.has_latents()) {
+            for (stage, batch) in
+                cases.iter().filter(|(stage, _)| *stage == Stage::Stage1 || network.architecture.supports_clusters())
+            {
                 let pairs = both(network, *stage, batch, &Loss::default(), &Device::flex());
                 let largest = |values: &[f32]| values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
                 let scale = pairs.iter().map(|(plain, _)| largest(plain)).fold(0.0, f32::max);
                 for (plain, again) in pairs {
-                    if !network.variant.has_norms() && !network.has_latents() {
+                    if !network.variant.has_norms() && network.architecture == Architecture::Clift {
                         assert_eq!(plain, again, "bit for bit");
                     }
                     // Burn adds the gradients of a composed norm in the order of the whole graph. The floor covers

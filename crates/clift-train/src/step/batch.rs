@@ -2,7 +2,7 @@
 // N tokens, K kept tokens, D width
 
 use clift_data::{Clip, SkippedScene};
-use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters, Tokens};
+use clift_model::{Clift, Clusters, RenderTokens, SceneClusters, Tokens};
 
 use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
@@ -59,14 +59,16 @@ impl StageBatch {
 
 impl BatchTokens {
     /// Selects the tokens of the renderer from the encoder's tokens.
-    pub(crate) fn apply(&self, condenser: &Condenser, lift: Tokens) -> Result<RenderTokens, TrainError> {
-        Ok(match self {
-            Self::All => lift.into(),
-            Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
-            Self::Clusters(clusters) => {
-                let index = Clusters::new(clusters.clone())?.upload(&lift.values.device());
-                condenser.forward(lift, &index).into()
-            }
-        })
+    pub(crate) fn step(&self) -> impl Fn(&Clift, Tokens) -> Result<RenderTokens, TrainError> {
+        move |model: &Clift, lift: Tokens| {
+            Ok(match self {
+                Self::All => lift.into(),
+                Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+                Self::Clusters(clusters) => {
+                    let index = Clusters::new(clusters.clone())?.upload(&lift.values.device());
+                    model.compress(lift, &index).into()
+                }
+            })
+        }
     }
 }

@@ -4,7 +4,7 @@
 use burn::tensor::{Device, Tensor};
 use clift_data::Clip;
 use clift_eval::{upload_cameras, upload_images, upload_views};
-use clift_model::{Cameras, Clift, Views};
+use clift_model::{Cameras, Clift, Pass, TokenStep, Views};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -36,6 +36,25 @@ impl DeviceBatch {
     }
 }
 
+impl DeviceBatch {
+    /// Returns the same views without autodiff.
+    pub(crate) fn untracked(&self) -> Self {
+        let cameras = |cameras: &Cameras| Cameras {
+            c2w: cameras.c2w.clone().inner(),
+            intrinsics: cameras.intrinsics.clone().inner(),
+            ..*cameras
+        };
+        let context = Views { images: self.context.images.clone().inner(), cameras: cameras(&self.context.cameras) };
+        let (targets, target_images) = (cameras(&self.targets), self.target_images.clone().inner());
+        Self { context, targets, target_images }
+    }
+
+    /// Describes the forward pass of a model from the context views to images of the target views.
+    pub(crate) fn pass<'a>(&'a self, model: &'a Clift, token_step: TokenStep<'a, TrainError>) -> Pass<'a, TrainError> {
+        Pass::new(model, &self.context, &self.targets, token_step)
+    }
+}
+
 /// Renders the target views from selected tokens and returns the loss, with autodiff.
 ///
 /// # Errors
@@ -46,7 +65,6 @@ pub fn render_loss(
     batch_tokens: &BatchTokens,
     loss: &Loss,
 ) -> Result<LossParts, TrainError> {
-    let lift = model.encode(&device_batch.context); // [B, N, D]
-    let tokens = batch_tokens.apply(&model.condenser, lift)?;
-    Ok(loss.of(model.renderer.forward(tokens, &device_batch.targets), device_batch.target_images.clone()))
+    let images = device_batch.pass(model, &batch_tokens.step()).render()?;
+    Ok(loss.of(images, device_batch.target_images.clone()))
 }

@@ -117,8 +117,9 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     }
     let model_args = ModelArgs::find(&args.model, args.data.as_deref(), &args.overrides)?;
     let ModelArgs { given, path, config, .. } = &model_args;
-    if config.model.has_latents() && args.save_clusters.is_some() {
-        usage_bail!("--save-clusters: the latents of {} are not clustered; leave the option out", given.display());
+    let supports_clusters = config.model.architecture.supports_clusters();
+    if !supports_clusters && args.save_clusters.is_some() {
+        usage_bail!("--save-clusters: the tokens of {} are not clustered; leave the option out", given.display());
     }
     let source = model_args.open_data(args.split)?.source;
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
@@ -128,7 +129,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then_some(context),
         num_context: model_args.num_context(reader.source.as_ref(), scene)?,
-        stored_tokens: TokenCount::Share(if config.model.has_latents() { 1.0 } else { 0.25 }),
+        stored_tokens: TokenCount::Share(if supports_clusters { 0.25 } else { 1.0 }),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
@@ -243,8 +244,10 @@ enum Coding {
 impl Coding {
     fn new(args: &EncodeArgs, weights: &Path, model: &TrainedModel) -> anyhow::Result<Self> {
         let is_coded = matches!(args.format, Some(TokenCoding::Coded(_)));
-        if model.config.has_latents() && (is_coded || args.quality.is_some() || args.size_kb.is_some()) {
-            usage_bail!("the latents of lvsm-ed have no codec; store them with --format f32, f16 or int8");
+        let architecture = model.config.architecture;
+        let is_coded = is_coded || args.quality.is_some() || args.size_kb.is_some();
+        if is_coded && !architecture.supports_clusters() {
+            usage_bail!("the tokens of {architecture} have no codec; store them with --format f32, f16 or int8");
         }
         let found = || TokenCodec::beside(weights, model);
         let codec = || found()?.ok_or_else(|| ModelError::NoCodec { path: TokenCodec::path_of(weights) });
@@ -314,7 +317,7 @@ fn describe(encoded: &EncodedScene, stored: &str, path: &Path, names: &[String])
     let frames = scene.context_frames.iter().map(|&frame| frame_name(names, frame as usize));
     let frames = frames.collect::<Vec<_>>().join(", ");
     let clusters = match scene.kind {
-        TokenKind::Latents => String::new(),
+        TokenKind::All => String::new(),
         _ => format!("\ntokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}"),
     };
     format!(

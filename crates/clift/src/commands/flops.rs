@@ -84,7 +84,7 @@ fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
     // The paper counts rendering only.
     if convention != FlopConvention::Paper {
         rows.push(row("encode", num_tokens, model.encode_macs(num_context, height, width)?));
-        for count in counts.iter().filter(|_| !model.has_latents()) {
+        for count in counts.iter().filter(|_| model.architecture.supports_clusters()) {
             let tokens = count.of(num_tokens)?;
             rows.push(row("condense", tokens, model.condense_macs(num_tokens, tokens)));
         }

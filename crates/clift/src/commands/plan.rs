@@ -27,15 +27,15 @@ fn largest_tensors(config: &Config) -> anyhow::Result<String> {
     // A plan for a device that this machine does not have shows no limit.
     let limit = config.device.open().ok().and_then(|device| max_tensor_bytes(&device));
     let mut rows = Vec::new();
-    for part in config.parts() {
-        let LargestTensor { what, bytes: size, .. } = largest_tensor(config, part)?;
+    for &run_step in config.run_steps() {
+        let LargestTensor { what, bytes: size, .. } = largest_tensor(config, run_step)?;
         let verdict = match limit {
             Some(limit) if size > limit => "TOO LARGE: `clift train` refuses this config",
             Some(_) => "fits",
             None => "",
         };
         let limit = limit.map_or_else(|| "-".into(), memory_size);
-        rows.push([part.name().into(), what, memory_size(size), limit, verdict.into()]);
+        rows.push([run_step.name().into(), what, memory_size(size), limit, verdict.into()]);
     }
     Ok(format!("\n{}", table(["part", "largest tensor", "size", "limit", ""], rows)))
 }

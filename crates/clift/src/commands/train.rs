@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 use clift_eval::available_bytes;
-use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, Stage, StageSettings, memory_warning};
+use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning};
 
-use crate::commands::args::parse::{parse_count, parse_stage};
+use crate::commands::args::parse::{parse_count, parse_training_step};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::ranks::{connect, finish};
 use crate::interrupt;
@@ -32,11 +32,11 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     let stop = interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();
-    let (run_dir, has_latents) = (config.run_dir.clone(), config.model.has_latents());
+    let (run_dir, supports_clusters) = (config.run_dir.clone(), config.model.architecture.supports_clusters());
     let run = Run::open_on(ranks.clone(), config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, !has_latents))
+    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, supports_clusters))
 }
 
 #[derive(Debug, clap::Args)]
@@ -46,8 +46,8 @@ pub struct TrainArgs {
     #[command(flatten)]
     pub overrides: ConfigArgs,
     /// Run one stage: stage1, clusters or stage2
-    #[arg(long, value_name = "STAGE", value_parser = parse_stage)]
-    pub only: Option<Stage>,
+    #[arg(long, value_name = "STAGE", value_parser = parse_training_step)]
+    pub only: Option<RunStep>,
     /// Train and evaluate on the first K training scenes
     #[arg(long, value_name = "K", value_parser = parse_count)]
     pub overfit: Option<usize>,

@@ -161,12 +161,13 @@ fn folder_items(model_args: &ModelArgs, reader: &ClipReader) -> anyhow::Result<(
     Ok((items, skip_report))
 }
 
-/// Refuses latents, which the page could neither show on the context views nor select.
+/// Refuses learned tokens, which the page could neither show on the context views nor select.
 fn require_places(model: &ModelConfig, path: &Path) -> anyhow::Result<()> {
-    if model.has_latents() {
+    if !model.has_patch_tokens() {
         usage_bail!(
-            "{}: the viewer shows where tokens lie, and latents of lvsm-ed lie nowhere; use `clift render`",
-            path.display()
+            "{}: the viewer shows where tokens lie, and learned tokens of {} lie nowhere; use `clift render`",
+            path.display(),
+            model.architecture
         );
     }
     Ok(())

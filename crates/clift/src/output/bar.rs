@@ -18,7 +18,7 @@ pub struct Bar {
 
 impl Sink for Bar {
     fn event(&mut self, event: &Event) {
-        if matches!(event, Event::StageStarted { .. } | Event::ImageSize { .. } | Event::StageFinished { .. })
+        if matches!(event, Event::StepStarted { .. } | Event::ImageSize { .. } | Event::StepFinished { .. })
             && let Some(bar) = self.bar.take()
         {
             bar.finish_and_clear();
@@ -30,8 +30,8 @@ impl Sink for Bar {
             }
         }
         match (event, &self.bar) {
-            (Event::StageStarted { stage, done, num_steps }, _) => {
-                self.bar = Some(progress_bar(stage.name(), *done, *num_steps));
+            (Event::StepStarted { run_step, done, num_steps }, _) => {
+                self.bar = Some(progress_bar(run_step.name(), *done, *num_steps));
             }
             // Steps with images of another size take another time.
             (Event::ImageSize { stage, done, last_step_of_size, last_step, .. }, _) => {
@@ -96,14 +96,14 @@ mod tests {
     fn bar_follows_steps_and_template_is_valid() {
         assert!(ProgressStyle::with_template(TEMPLATE).is_ok());
         let mut sink = Bar::default();
-        sink.event(&Event::StageStarted { stage: Stage::Stage1, done: 40, num_steps: 100 });
+        sink.event(&Event::StepStarted { run_step: Stage::Stage1.into(), done: 40, num_steps: 100 });
         sink.event(&step(41, 0.1));
         assert_eq!(sink.bar.as_ref().map(ProgressBar::position), Some(41));
         let size = [32, 16];
         sink.event(&Event::ImageSize { stage: Stage::Stage1, size, done: 41, last_step_of_size: 60, last_step: 100 });
         let state = |bar: &ProgressBar| (bar.position(), bar.length());
         assert_eq!(sink.bar.as_ref().map(state), Some((41, Some(100))));
-        sink.event(&Event::StageFinished { stage: Stage::Stage1, elapsed_s: 1.0 });
+        sink.event(&Event::StepFinished { run_step: Stage::Stage1.into(), elapsed_s: 1.0 });
         assert!(sink.bar.is_none());
     }
 

@@ -1,6 +1,6 @@
 //! Events of a run as lines of text, for the bar and for log files.
 
-use clift_train::{Event, Stage, StepEvent};
+use clift_train::{Event, RunStep, StepEvent};
 
 use crate::output::units::{duration, memory_size, seconds};
 
@@ -15,16 +15,18 @@ pub(crate) fn time_left(seconds: f64, last_step_of_size: u64, last_step: u64) ->
 }
 
 pub(crate) fn event_line(event: &Event) -> Option<String> {
-    let unit = |stage: Stage| match stage {
-        Stage::Stage1 | Stage::Stage2 => "steps",
-        Stage::Clusters => "context sets",
-        Stage::Eval => "scenes",
+    let unit = |run_step: &RunStep| match run_step {
+        RunStep::Train(_) => "steps",
+        RunStep::Clusters => "context sets",
+        RunStep::Eval => "scenes",
     };
     Some(match event {
         Event::Scan { .. } | Event::Step(_) | Event::Progress { .. } => return None,
-        Event::StageStarted { stage, done: 0, num_steps } => format!("{}: {num_steps} {}", stage.name(), unit(*stage)),
-        Event::StageStarted { stage, done, num_steps } => {
-            format!("{}: resumed after {done} of {num_steps} {}", stage.name(), unit(*stage))
+        Event::StepStarted { run_step, done: 0, num_steps } => {
+            format!("{}: {num_steps} {}", run_step.name(), unit(run_step))
+        }
+        Event::StepStarted { run_step, done, num_steps } => {
+            format!("{}: resumed after {done} of {num_steps} {}", run_step.name(), unit(run_step))
         }
         Event::ImageSize { stage, size: [width, height], last_step_of_size: last_step, .. } => {
             format!("{}: images of {width} x {height} pixels to step {last_step}", stage.name())
@@ -35,7 +37,7 @@ pub(crate) fn event_line(event: &Event) -> Option<String> {
             let memory = peak_bytes.map_or_else(|| "unknown".into(), memory_size);
             format!("{}: {} per step, {left}, peak memory so far: {memory}", stage.name(), seconds(*step_s))
         }
-        Event::StageFinished { stage, elapsed_s } => format!("{}: done in {}", stage.name(), duration(*elapsed_s)),
+        Event::StepFinished { run_step, elapsed_s } => format!("{}: done in {}", run_step.name(), duration(*elapsed_s)),
         Event::Evaluated { stage, step, psnr, ssim, num_views } => {
             let ssim = ssim.map(|ssim| format!(", SSIM {ssim:.3}")).unwrap_or_default();
             format!("{} step {step}: {psnr:.2} dB{ssim} over {num_views} validation views", stage.name())
@@ -49,6 +51,8 @@ pub(crate) fn event_line(event: &Event) -> Option<String> {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use clift_train::Stage;
+
     use super::*;
 
     /// An update of stage 1.

@@ -46,15 +46,15 @@ impl<W: Write> Sink for PlainLines<W> {
     fn event(&mut self, event: &Event) {
         let line = match event {
             Event::Step(step) => self.step_line(step),
-            Event::Progress { stage, done, total } => {
+            Event::Progress { run_step, done, total } => {
                 let tenth = done * 10 / (*total).max(1);
-                let line = (tenth > self.printed_tenth).then(|| format!("{} {done}/{total}", stage.name()));
+                let line = (tenth > self.printed_tenth).then(|| format!("{} {done}/{total}", run_step.name()));
                 self.printed_tenth = self.printed_tenth.max(tenth);
                 line
             }
             _ => event_line(event),
         };
-        if matches!(event, Event::StageStarted { .. } | Event::ImageSize { .. }) {
+        if matches!(event, Event::StepStarted { .. } | Event::ImageSize { .. }) {
             (self.pace, self.since_line_s, self.printed_tenth) = ((0, 0.0), 0.0, 0);
         }
         if let Some(line) = line {
@@ -65,7 +65,7 @@ impl<W: Write> Sink for PlainLines<W> {
 
 #[cfg(test)]
 mod tests {
-    use clift_train::Stage;
+    use clift_train::{RunStep, Stage};
 
     use super::*;
     use crate::output::event_line::tests::step;
@@ -80,9 +80,9 @@ mod tests {
 
     #[test]
     fn steps_print_one_line_per_ten_seconds() {
-        let mut events = vec![Event::StageStarted { stage: Stage::Stage1, done: 0, num_steps: 100 }];
+        let mut events = vec![Event::StepStarted { run_step: Stage::Stage1.into(), done: 0, num_steps: 100 }];
         events.extend((1..=100).map(|number| step(number, 0.25)));
-        events.push(Event::StageFinished { stage: Stage::Stage1, elapsed_s: 25.0 });
+        events.push(Event::StepFinished { run_step: Stage::Stage1.into(), elapsed_s: 25.0 });
         events.insert(
             1,
             Event::ImageSize { stage: Stage::Stage1, size: [32, 16], done: 0, last_step_of_size: 60, last_step: 100 },
@@ -102,7 +102,7 @@ stage1: done in 25 s
     #[test]
     fn events_are_printed_at_once() {
         let events = [
-            Event::StageStarted { stage: Stage::Stage2, done: 40, num_steps: 100 },
+            Event::StepStarted { run_step: Stage::Stage2.into(), done: 40, num_steps: 100 },
             Event::Evaluated { stage: Stage::Stage2, step: 50, psnr: 24.309, ssim: None, num_views: 12 },
             Event::Pace {
                 stage: Stage::Stage2,
@@ -115,7 +115,7 @@ stage1: done in 25 s
             Event::Checkpoint { path: "runs/tiny/stage2/step-50".into() },
             Event::Skipped { key: "room".into(), reason: "3 frames".into() },
             Event::Warning("hot".into()),
-            Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: 7 },
+            Event::StepStarted { run_step: RunStep::Eval, done: 0, num_steps: 7 },
         ];
         let expected = "stage2: resumed after 40 of 100 steps
 stage2 step 50: 24.31 dB over 12 validation views
@@ -130,7 +130,8 @@ eval: 7 scenes
 
     #[test]
     fn progress_prints_every_tenth() {
-        let events: Vec<_> = (1..=40).map(|done| Event::Progress { stage: Stage::Clusters, done, total: 40 }).collect();
+        let events: Vec<_> =
+            (1..=40).map(|done| Event::Progress { run_step: RunStep::Clusters, done, total: 40 }).collect();
         let text = printed(&events);
         assert_eq!(text.lines().count(), 10);
         assert!(text.starts_with("clusters 4/40\nclusters 8/40\n") && text.ends_with("clusters 40/40\n"));

@@ -1,7 +1,8 @@
 //! Layers of the networks: `norms` of tokens, queries and keys; `attention` and `feed_forward` layers; and in `block` the
-//! pre-norm encoder and decoder blocks that are made of them.
+//! pre-norm encoder and decoder blocks that are made of them. `pixels` embeds patches and decodes images.
 
 pub(crate) mod attention;
 pub(crate) mod block;
 pub(crate) mod feed_forward;
 pub(crate) mod norms;
+pub(crate) mod pixels;

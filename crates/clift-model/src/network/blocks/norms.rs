@@ -8,17 +8,17 @@ use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::ops::rms_norm::rms_norm_heads;
 
-/// A layer norm of the encoder's tokens in the released DL3DV network, the identity in the others. Stage 2 freezes the
-/// encoder; both stages train this norm.
+/// A layer norm of the encoder's tokens in the released DL3DV network. Stage 2 freezes the encoder; both stages train this
+/// norm.
 #[derive(Module, Debug)]
 pub struct LiftNorm {
-    norm: Option<LayerNorm>,
+    norm: LayerNorm,
 }
 
 impl LiftNorm {
-    /// Makes the norm of the variant.
+    /// Makes the norm of tokens of the width of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
-        Self { norm: config.has_token_norm().then(|| init.layer_norm(config.dim)) }
+        Self { norm: init.layer_norm(config.dim) }
     }
 
     /// Returns the tokens that K-means, condenser and renderer read.
@@ -26,10 +26,7 @@ impl LiftNorm {
     /// # Shapes
     /// - `lift` and the result: `[batch, num_tokens, dim]`
     pub fn forward(&self, lift: Tensor<3>) -> Tensor<3> {
-        match &self.norm {
-            Some(norm) => norm.forward(lift),
-            None => lift,
-        }
+        self.norm.forward(lift)
     }
 }
 
@@ -42,9 +39,9 @@ pub struct QkNorm {
 }
 
 impl QkNorm {
-    /// Makes the norms of an attention layer; `None` in variants without them.
+    /// Makes the norms of an attention layer; `None` in networks without them.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Option<Self> {
-        config.has_query_key_norms().then(|| {
+        init.has_query_key_norms().then(|| {
             let head_width = config.dim / config.num_heads;
             Self { query: init.rms_norm(head_width), key: init.rms_norm(head_width) }
         })

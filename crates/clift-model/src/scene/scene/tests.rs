@@ -105,7 +105,7 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
 fn latents_are_stored_without_places() {
     let folder = Folder::new();
     let model = ModelConfig { dim: DIM, num_heads: 2, num_latents: 5, ..small_lvsm(CliftVariant::Paper) };
-    let latents = Scene { kind: TokenKind::Latents, model, token_ids: (0..5).collect(), ..scene() };
+    let latents = Scene { kind: TokenKind::All, model, token_ids: (0..5).collect(), ..scene() };
     for format in TokenFormat::ALL {
         latents.write(&folder.path(), format).expect("writes");
         let bytes = std::fs::read(folder.path()).expect("reads");
@@ -122,7 +122,7 @@ fn latents_are_stored_without_places() {
         folder.assert_refused(&with_header(&bytes, &[(from, to)]), expected);
     }
     let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
-    assert!(folder.write_error(&few, "few", TokenFormat::F32).contains("expected all 5 latents in order"));
+    assert!(folder.write_error(&few, "few", TokenFormat::F32).contains("expected all 5 learned tokens in order"));
     let kind = Scene { kind: TokenKind::Clift, ..latents };
     assert!(folder.write_error(&kind, "kind", TokenFormat::F32).contains("clift tokens of a network of lvsm-ed"));
 }

@@ -173,7 +173,7 @@ fn interrupted_runs_resume_on_any_number_of_ranks() {
     interrupted(3, 0, Stage::Stage1, 13);
     interrupted(1, 0, Stage::Stage1, 17);
     let ended = train(2, &config, |rank, event| {
-        rank == 1 && matches!(event, Event::Progress { stage: Stage::Clusters, done: 2, .. })
+        rank == 1 && matches!(event, Event::Progress { run_step: RunStep::Clusters, done: 2, .. })
     });
     assert!(ended.iter().all(|end| matches!(end, Err(TrainError::Interrupted { step: 4 }))), "{ended:?}");
     interrupted(3, 2, Stage::Stage2, 7);
@@ -215,7 +215,7 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
             assert!(subsets.iter().flatten().flatten().all(|&token| token < num_tokens));
         }
     }
-    run.train(Some(Stage::Stage1), &AtomicBool::new(false), &mut sink).expect("trains");
+    run.train(Some(Stage::Stage1.into()), &AtomicBool::new(false), &mut sink).expect("trains");
     assert_eq!(sizes, [([8, 8], 0, 13), ([16, 16], 13, 24)]);
     drop(run);
 
@@ -286,7 +286,7 @@ fn a_failing_save_ends_all_ranks() {
     // A file where the folder of the checkpoints should be.
     let stage1 = place.path().join("run/stage1");
     let ended = train(2, &config, |rank, event| {
-        if rank == 0 && matches!(event, Event::StageStarted { stage: Stage::Stage1, .. }) {
+        if rank == 0 && matches!(event, Event::StepStarted { run_step: RunStep::Train(Stage::Stage1), .. }) {
             std::fs::create_dir_all(&stage1).expect("writable");
             std::fs::write(stage1.join("checkpoints"), "full").expect("writable");
         }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clift_data::Split;
 use clift_eval::MethodFilter;
-use clift_train::{ExportFormat, Stage};
+use clift_train::{ExportFormat, RunStep, Stage};
 
 /// Parses two methods, as `kmeans,clift`.
 pub(crate) fn parse_methods(text: &str) -> Result<[MethodFilter; 2], String> {
@@ -43,9 +43,12 @@ pub(crate) fn parse_split(text: &str) -> Result<Split, String> {
     splits.into_iter().find(|split| split.to_string() == text).ok_or_else(|| "write train or test".into())
 }
 
-pub(crate) fn parse_stage(text: &str) -> Result<Stage, String> {
-    let stages = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
-    stages.into_iter().find(|stage| stage.name() == text).ok_or_else(|| "write stage1, clusters or stage2".into())
+pub(crate) fn parse_training_step(text: &str) -> Result<RunStep, String> {
+    let steps = [Stage::Stage1.into(), RunStep::Clusters, Stage::Stage2.into()];
+    steps
+        .into_iter()
+        .find(|step: &RunStep| step.name() == text)
+        .ok_or_else(|| "write stage1, clusters or stage2".into())
 }
 
 pub(crate) fn parse_count(text: &str) -> Result<usize, String> {

@@ -1,16 +1,17 @@
-//! Encoder, condenser and renderer together.
+//! Encoder, token norm, condenser and renderer together.
 
 use burn::module::Module;
 use burn::store::PathFilter;
 use burn::tensor::{Device, Tensor};
 
 use crate::network::blocks::norms::LiftNorm;
-use crate::network::condenser::Condenser;
+
 use crate::network::config::ModelConfig;
-use crate::network::encoder::Encoder;
 use crate::network::init::Init;
+use crate::network::parts::condenser::Condenser;
+use crate::network::parts::encoder::Encoder;
+use crate::network::parts::renderer::Renderer;
 use crate::network::render_tokens::RenderTokens;
-use crate::network::renderer::Renderer;
 use crate::network::tokens::Tokens;
 use crate::tokens::clusters::ClusterIndex;
 use crate::views::upload::{Cameras, Views};
@@ -20,8 +21,8 @@ use crate::views::upload::{Cameras, Views};
 pub struct Clift {
     /// Context views to light-field tokens.
     pub encoder: Encoder,
-    /// Norm of the encoder's tokens, the identity in variants without one. Both stages train it.
-    pub lift_norm: LiftNorm,
+    /// Norm of the encoder's tokens, of variants that have one. Both stages train it.
+    pub lift_norm: Option<LiftNorm>,
     /// Light-field tokens to storage tokens.
     pub condenser: Condenser,
     /// Tokens and a camera to an image.
@@ -36,7 +37,7 @@ impl Clift {
         let renderer = Renderer::new(config, &mut init);
         // The condenser comes after encoder and renderer, whose weights so do not depend on its settings.
         let condenser = Condenser::new(config, &mut init);
-        let lift_norm = LiftNorm::new(config, &mut init);
+        let lift_norm = config.has_token_norm().then(|| LiftNorm::new(config, &mut init));
         Self { encoder, lift_norm, condenser, renderer }
     }
 
@@ -63,8 +64,10 @@ impl Clift {
     /// # Shapes
     /// - `features` and the result: `[batch, num_tokens, dim]`
     pub fn normalize(&self, features: Tokens) -> Tokens {
-        let values = self.lift_norm.forward(features.values);
-        Tokens { values, ..features }
+        match &self.lift_norm {
+            Some(norm) => Tokens { values: norm.forward(features.values), ..features },
+            None => features,
+        }
     }
 
     /// Returns the tokens of context views: [`normalize`](Self::normalize) of the [`features`](Self::features).
@@ -88,6 +91,9 @@ impl Clift {
     ///
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
+    ///
+    /// # Panics
+    /// If the network has camera-relative attention and the tokens were made [without cameras](Tokens::without_cameras).
     pub fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         self.renderer.render(tokens, targets)
     }
