@@ -10,7 +10,8 @@ pub enum TokenKind {
     Clift,
     /// The tokens nearest to the K-means centers, rendered with the renderer of stage 1.
     Kmeans,
-    /// All tokens of a network without clusters, which has one stage.
+    /// All tokens of a network without clusters, which has one stage; LVSM's learned latents.
+    #[strum(serialize = "latents")]
     All,
 }
 

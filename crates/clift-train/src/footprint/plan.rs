@@ -12,7 +12,7 @@ use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::sent_bytes;
 use crate::error::TrainError;
-use crate::events::Stage;
+use crate::events::{RunStep, Stage};
 use crate::footprint::memory::peak_bytes;
 use crate::footprint::scene_sizes::{
     eval_sizes, num_tokens, possible_sizes, scene_with_all_tokens, scene_with_stored_tokens,
@@ -66,10 +66,10 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
     let share = |part: PartPlan| PartPlan { count: part.count.map(|count| count.div_ceil(num_ranks as u64)), ..part };
-    let part = |part| match part {
-        Stage::Stage1 | Stage::Stage2 => update(config, part, &parameters, num_ranks),
-        Stage::Clusters => clusters(config).map(share),
-        Stage::Eval => evaluation(config).map(share),
+    let part = |&run_step: &RunStep| match run_step {
+        RunStep::Train(stage) => update(config, stage, &parameters, num_ranks),
+        RunStep::Clusters => clusters(config).map(share),
+        RunStep::Eval => evaluation(config).map(share),
     };
     Ok(Plan {
         num_ranks,
@@ -77,7 +77,7 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
         threads: rayon::current_num_threads(),
         num_tokens: [num_tokens(config, views.min_context)?, num_tokens(config, views.max_context)?],
         available_bytes: available_bytes(config.device),
-        parts: config.parts().into_iter().map(part).collect::<Result<_, _>>()?,
+        parts: config.run_steps().iter().map(part).collect::<Result<_, _>>()?,
         parameters,
     })
 }
@@ -123,7 +123,7 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, num_ranks: usi
     }
     let mut of_rank = config.clone();
     of_rank.set_accumulate(stage, parts.num_parts());
-    let mut part = untrained(&of_rank, stage, macs)?;
+    let mut part = untrained(&of_rank, RunStep::Train(stage), macs)?;
     if num_ranks > 1 {
         part.peak_bytes += sum_bytes(trained_parameters, num_ranks);
         // A part of every round is sent to the ranks that add it up, and once the sum to the others.
@@ -172,7 +172,7 @@ fn clusters(config: &Config) -> Result<PartPlan, TrainError> {
         (count, _) => Some(count),
     };
     let count = num_scenes.map(|count| (count * config.clusters.num_passes) as u64);
-    Ok(PartPlan { count, ..untrained(config, Stage::Clusters, macs)? })
+    Ok(PartPlan { count, ..untrained(config, RunStep::Clusters, macs)? })
 }
 
 fn evaluation(config: &Config) -> Result<PartPlan, TrainError> {
@@ -191,18 +191,18 @@ fn evaluation(config: &Config) -> Result<PartPlan, TrainError> {
         }
     }
     let count = (eval.num_scenes > 0).then_some(eval.num_scenes as u64);
-    Ok(PartPlan { count, ..untrained(config, Stage::Eval, macs)? })
+    Ok(PartPlan { count, ..untrained(config, RunStep::Eval, macs)? })
 }
 
-/// Returns the estimate of a part that trains no parameters, without its number of scenes.
-fn untrained(config: &Config, part: Stage, macs: f64) -> Result<PartPlan, TrainError> {
+/// Returns the estimate of a step of a run that trains no parameters, without its number of scenes.
+fn untrained(config: &Config, run_step: RunStep, macs: f64) -> Result<PartPlan, TrainError> {
     Ok(PartPlan {
-        part: part.name(),
+        part: run_step.name(),
         unit: "scene",
         count: None,
         trained_parameters: 0,
         gmacs: macs / 1e9,
-        peak_bytes: peak_bytes(config, part)?,
+        peak_bytes: peak_bytes(config, run_step)?,
         sent_bytes: 0,
     })
 }

@@ -87,7 +87,7 @@ impl Run {
             let architecture = config.model.architecture;
             let fix =
                 format!("model.architecture = \"{architecture}\" has one stage: write stage1, or leave --only out");
-            return Err(bad("--only", only.name(), fix));
+            return Err(bad("--only", only.name(), &fix));
         }
         largest_tensor::check_tensors(&config, &device, config.run_steps())?;
         // Missing weights are reported now, not after days of training.
