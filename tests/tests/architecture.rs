@@ -49,8 +49,9 @@ const CRATES: [Crate; 9] = [
     ),
 ];
 
-const MAX_FILES: usize = 15;
-const MAX_LINES: usize = 400;
+/// Lines of production code in a file: one idea fits in fewer than the first number, and no file has more than the second.
+const LONG: usize = 450;
+const MAX_LINES: usize = 600;
 
 #[test]
 fn sources_keep_the_layout() {
@@ -75,13 +76,6 @@ type Modules<'a> = BTreeMap<String, Module<'a>>;
 /// What breaks a rule, as `path:line: what`.
 fn violations(sources: &Sources) -> Vec<String> {
     let mut found = Vec::new();
-    let mut files_of = BTreeMap::<&str, usize>::new();
-    for (folder, _) in sources.keys().filter_map(|path| path.strip_suffix(".rs")?.rsplit_once('/')) {
-        *files_of.entry(folder).or_default() += 1;
-    }
-    for (folder, count) in files_of.into_iter().filter(|(_, count)| *count > MAX_FILES) {
-        found.push(format!("{folder}:1: {count} source files, more than {MAX_FILES}"));
-    }
     for (name, uses, order) in CRATES {
         check_dependencies(name, uses, sources, &mut found);
         let root = format!("crates/{name}/src/");
@@ -176,6 +170,8 @@ fn check_file(name: &str, module: &Module, modules: &Modules, found: &mut Vec<St
     let num_lines = module.text.lines().zip(&module.code).filter(is_production).count();
     if num_lines > MAX_LINES {
         add(1, format!("{num_lines} lines of production code, more than {MAX_LINES}"));
+    } else if num_lines > LONG {
+        eprintln!("warning: {} has {num_lines} lines of production code: is it one idea?", module.path);
     }
     if name.rsplit_once("::").is_some_and(|(folder, _)| modules.get(folder).is_none_or(|page| !page.is_folder())) {
         add(1, "its folder has no mod.rs".into());
@@ -331,7 +327,7 @@ fn small_tree(changes: &[(&str, &str)]) -> Sources {
 #[test]
 fn each_rule_reports_file_and_line() {
     assert_eq!(violations(&small_tree(&[])), [] as [&str; 0]);
-    let long = "fn f() {}\n".repeat(401);
+    let long = "fn f() {}\n".repeat(601);
     for (path, text, expected) in [
         ("Cargo.toml", "\n[dependencies]\nclift-data = {}\n", "3: clift-model does not stand above clift-data"),
         ("src/lib.rs", "pub mod error;\npub use crate::error::ModelError;\n", "1: a public module of a crate"),
@@ -340,7 +336,7 @@ fn each_rule_reports_file_and_line() {
         ("src/other.rs", "use crate::error::ModelError;\n", "1: other does not stand behind error"),
         ("src/network/block.rs", "\nuse super::{\n    Model,\n};\n", "2: network::block is in a circle"),
         ("src/network/block.rs", "use crate::ModelError;\n", "1: `ModelError` is in no file"),
-        ("src/network/block.rs", &long, "1: 401 lines of production code, more than 400"),
+        ("src/network/block.rs", &long, "1: 601 lines of production code, more than 600"),
         ("src/network/mod.rs", "mod block;\n", "1: a mod.rs without a page"),
         ("src/network/mod.rs", "//! A page.\nmod block;\npub struct Model;\n", "3: code in a mod.rs"),
         ("src/scene/read.rs", "", "1: its folder has no mod.rs"),
@@ -349,8 +345,4 @@ fn each_rule_reports_file_and_line() {
         let expected = format!("crates/clift-model/{path}:{expected}");
         assert!(found.iter().any(|one| one.starts_with(&expected)), "{expected}: {found:?}");
     }
-    let many: Vec<String> = (0..14).map(|i| format!("src/network/file{i}.rs")).collect();
-    let many: Vec<(&str, &str)> = many.iter().map(|path| (path.as_str(), "")).collect();
-    let full = violations(&small_tree(&many));
-    assert_eq!(full, ["crates/clift-model/src/network:1: 17 source files, more than 15"]);
 }

@@ -25,7 +25,7 @@ pub const PRECISION_CASES: [BenchCase; 4] =
 pub struct PrecisionReport {
     /// Device of the tensors.
     pub device: DeviceName,
-    /// What f32 is compared with.
+    /// Precision compared with f32.
     pub precision: Precision,
     /// One row per case.
     pub rows: Vec<PrecisionRow>,

@@ -1,4 +1,4 @@
-//! What models and data share: cameras and poses, images, atomic files, statistics, random streams.
+//! The common ground of models and data: cameras and poses, images, atomic files, statistics, random streams.
 //!
 //! Camera axes are OpenCV's: +x right, +y down, +z forward. This crate does not depend on Burn.
 //!

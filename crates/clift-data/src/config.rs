@@ -37,7 +37,7 @@ pub struct DataConfig {
     pub crop: Crop,
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     pub flip: bool,
-    /// Where a data set has no test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
+    /// For data sets without a test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
     /// never read in training, as in the practice of `NeRF`; 0 holds out no frame, and training scenes are evaluated.
     pub hold_out: usize,
     /// Filters of the scenes on disk.

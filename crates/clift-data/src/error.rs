@@ -37,7 +37,7 @@ pub enum DataError {
         /// Archive of the pickle.
         path: PathBuf,
     },
-    /// A chunk is truncated, is no ZIP archive, or violates the chunk format.
+    /// A chunk is truncated, is not a ZIP archive, or violates the chunk format.
     #[error("bad chunk: {what}: {path}", path = path.display())]
     BadChunk {
         /// Problem, with the scene key if known.
@@ -45,7 +45,7 @@ pub enum DataError {
         /// Chunk file.
         path: PathBuf,
     },
-    /// A PyTorch checkpoint is truncated, is no ZIP archive, or lacks a requested tensor.
+    /// A PyTorch checkpoint is truncated, is not a ZIP archive, or lacks a requested tensor.
     #[error("bad checkpoint: {what}: {path}", path = path.display())]
     BadCheckpoint {
         /// Problem, with the tensor's key if known.
@@ -127,7 +127,7 @@ pub enum DataError {
         /// Number of frames of the scene.
         num_frames: usize,
     },
-    /// An image file is no readable JPEG or PNG, or the image exceeds the size limit.
+    /// An image file is not a readable JPEG or PNG, or the image exceeds the size limit.
     #[error("frame {frame} of scene {key} cannot be decoded: {what}")]
     BadImage {
         /// Scene key.

@@ -270,7 +270,7 @@ fn scene_files_overwrite_only_scene_files() {
     let encode = |words: &str| place.clift(&format!("{ENCODE} DIR/{words}"));
     let weights = place.bytes("run/stage1/model.safetensors");
     encode("run/stage1/model.safetensors")
-        .fails_with(2, &["the existing file is no scene, and only scenes are overwritten"]);
+        .fails_with(2, &["the existing file is not a scene, and only scenes are overwritten"]);
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
     encode("no/room.clift").fails_with(2, &["no folder "]);
     encode("room.clift").ok();

@@ -21,7 +21,7 @@ pub const MAX_CHECKED_TOKENS: usize = 1024;
 /// Cases to time and their sizes.
 #[derive(Clone, Debug)]
 pub struct BenchOptions {
-    /// The cases, in any order; they run in that of [`BenchCase::ALL`].
+    /// The cases, in any order; they run in the order of [`BenchCase::ALL`].
     pub cases: Vec<BenchCase>,
     /// Timed repetitions, at least 1.
     pub repeats: usize,
@@ -48,7 +48,7 @@ impl BenchOptions {
 /// Sizes, device and inputs shared by all rows.
 pub struct BenchContext {
     pub config: Config,
-    /// Where tensors live, without autodiff.
+    /// Device of the tensors, without autodiff.
     pub device: Device,
     /// Whether tensors are in the memory of this process.
     pub is_cpu: bool,

@@ -80,7 +80,7 @@ pub fn remove_folder(path: &Path) -> std::io::Result<()> {
 }
 
 /// Removes the temporary files and folders that killed processes left in `folder` and below it. No other process may
-/// write there. A missing folder is no error.
+/// write there. A missing folder is not an error.
 ///
 /// # Errors
 /// Errors of the operating system.

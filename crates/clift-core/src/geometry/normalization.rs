@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::CameraError;
 use crate::geometry::pose::{Pose, unit_quaternion};
 
-/// How the mean orientation of the context cameras is computed.
+/// Definition of the mean orientation of the context cameras.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PoseRotation {

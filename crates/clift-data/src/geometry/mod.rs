@@ -1,4 +1,4 @@
-//! What data sets need beyond the cameras of `clift-core`.
+//! Camera geometry of data sets, beyond the cameras of `clift-core`.
 //!
 //! - `lens`: OpenCV and COLMAP lens distortion
 //! - `overlap`: view overlap of two cameras

@@ -173,7 +173,7 @@ pub fn even_views_of(
     let context: Vec<usize> = (0..num_context).map(|view| frames[spread(view, num_context, frames.len())]).collect();
     let rest = targets.unwrap_or(frames).iter().copied().filter(|frame| !context.contains(frame));
     let rest: Vec<usize> = rest.collect();
-    // With two frames to spare, the outermost ones, next to a context, are no targets.
+    // With two frames to spare, the outermost ones, next to a context, are not targets.
     let has_spare = rest.len() >= num_targets + 2;
     let position = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
     let target = (0..num_targets).map(|target| rest[position(target)]).collect();

@@ -183,7 +183,7 @@ impl ViewSampler {
     }
 }
 
-/// Samples stage-2 targets of a stored context set: frames between the first and the last context that are no contexts.
+/// Samples stage-2 targets of a stored context set: frames between the first and the last context that are not context views.
 ///
 /// Targets repeat only if there are fewer candidates than targets. Without any candidate, contexts are sampled with
 /// replacement.

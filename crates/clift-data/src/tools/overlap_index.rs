@@ -65,7 +65,7 @@ impl OverlapOptions {
         let (most, frames) = if self.context_targets {
             (near + 1, "the frames of the smallest gap")
         } else {
-            (near + 1 - num_context, "the frames of the smallest gap that are no contexts")
+            (near + 1 - num_context, "the frames of the smallest gap that are not context views")
         };
         check_config((1..=most).contains(&num_targets), "num_targets", num_targets, || {
             format!("use 1 to {most}, {frames}")

@@ -1,4 +1,4 @@
-//! A check of an encoded scene: a frame that is no context, rendered and compared with the nearest context view.
+//! A check of an encoded scene: a frame that is not a context view, rendered and compared with the nearest context view.
 
 use clift_core::Camera;
 use clift_data::{ClipReader, ViewIndices};
@@ -11,7 +11,7 @@ use crate::sweep::baselines::{nearest_image, view_image};
 /// Largest number of frames that are tried: images may be unreadable.
 const MAX_TRIES: usize = 3;
 
-/// A frame that is no context, rendered from the stored tokens.
+/// A frame that is not a context view, rendered from the stored tokens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HeldOutFrame {
     /// The frame of the scene.
@@ -58,7 +58,7 @@ pub(crate) struct CheckViews {
 }
 
 impl CheckViews {
-    /// Reads up to `count` frames that are no contexts, the first [`candidates`]; `None` if none is readable.
+    /// Reads up to `count` frames that are not context views, the first [`candidates`]; `None` if none is readable.
     pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, EvalError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let frames = candidates(&context, reader.source.cameras(index)?.len());
@@ -111,7 +111,7 @@ pub(crate) fn render_scene(
     Ok(rendered.into_iter().map(|view| view.pixels).collect())
 }
 
-/// Returns the frames that are no contexts: those between the contexts, the farthest from a context first, then the others,
+/// Returns the frames that are not context views: those between the contexts, the farthest from a context first, then the others,
 /// the nearest first.
 fn candidates(context: &[usize], num_frames: usize) -> Vec<usize> {
     let mut frames: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();

@@ -72,7 +72,7 @@ impl TokenCodec {
     /// Reads and checks a codec.
     ///
     /// # Errors
-    /// [`ModelError::NoCodec`] without the file, [`ModelError::CodecFile`] for a file that is no codec, is damaged or
+    /// [`ModelError::NoCodec`] without the file, [`ModelError::CodecFile`] for a file that is not a codec, is damaged or
     /// inconsistent.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         let size = match std::fs::metadata(path) {
@@ -203,7 +203,7 @@ fn check_transform(transform: &Transform) -> Result<(), String> {
 fn check_distributions(distributions: &Distributions) -> Result<(), String> {
     let Distributions { knots, cumulative } = distributions;
     if knots.len() < 2 || !knots.windows(2).all(|pair| pair[0] < pair[1]) {
-        return Err("the knots are no ascending numbers".into());
+        return Err("the knots are not ascending numbers".into());
     }
     let is_distribution =
         |row: &[f32]| row[0] == 0.0 && row[row.len() - 1] == 1.0 && row.windows(2).all(|pair| pair[0] <= pair[1]);

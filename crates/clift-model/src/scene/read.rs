@@ -33,7 +33,7 @@ impl Scene {
     /// Reads and checks a scene file. Coded tokens need the codec of the scene's model, see [`find_model`](Self::find_model).
     ///
     /// # Errors
-    /// [`ModelError::SceneFile`] for a file that is no scene, has another version, is truncated or inconsistent, and for
+    /// [`ModelError::SceneFile`] for a file that is not a scene, has another version, is truncated or inconsistent, and for
     /// coded tokens without their codec.
     pub fn read(path: &Path) -> Result<(Self, TokenCoding), ModelError> {
         Self::read_for(path, None)
@@ -89,7 +89,7 @@ fn from_bytes(
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?;
     let fields = Fields(metadata.metadata().clone().unwrap_or_default());
     if fields.0.get("format").map(String::as_str) != Some(FORMAT) {
-        return Err(refusal("the file is no scene: its header lacks the scene format", GIVE_ANOTHER));
+        return Err(refusal("the file is not a scene: its header lacks the scene format", GIVE_ANOTHER));
     }
     let version = fields.get("version")?;
     if version == CODED_VERSION {

@@ -138,7 +138,7 @@ impl SceneRenderer {
     /// [`ModelError::Device`] if an image cannot be read from the device.
     ///
     /// # Panics
-    /// If a side is no multiple of the patch.
+    /// If a side is not a multiple of the patch.
     pub fn render(
         &mut self,
         views: &[Camera],

@@ -27,9 +27,9 @@ pub fn check_output_path(path: &Path) -> Result<(), ModelError> {
     match std::fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         Err(error) => refuse(&error.to_string(), WRITABLE_FOLDER),
-        Ok(found) if !found.is_file() => refuse("the existing item is no regular file", OTHER_NAME),
+        Ok(found) if !found.is_file() => refuse("the existing item is not a regular file", OTHER_NAME),
         Ok(_) if is_scene(path) => Ok(()),
-        Ok(_) => refuse("the existing file is no scene, and only scenes are overwritten", OTHER_NAME),
+        Ok(_) => refuse("the existing file is not a scene, and only scenes are overwritten", OTHER_NAME),
     }
 }
 

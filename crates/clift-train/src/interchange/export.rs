@@ -114,7 +114,7 @@ fn export_published(
         tensors.push((format!("{PREFIX}{}", tensor.key), shape, values));
     }
     if let Some(path) = ours.keys().next() {
-        return Err(bad(format!("{path} is no parameter of a {} network", config.model.variant)));
+        return Err(bad(format!("{path} is not a parameter of a {} network", config.model.variant)));
     }
     let exported = Exported {
         num_tensors: tensors.len(),

@@ -1,4 +1,4 @@
-//! Frames of a run's scene that have a true image and are no contexts.
+//! Frames of a run's scene that have a true image and are not context views.
 
 use clift_core::{Camera, ClipViews, Pose};
 use clift_data::{ClipReader, ViewIndices};
@@ -24,7 +24,7 @@ pub struct TrueImage {
     pub camera: Camera,
 }
 
-/// Lists the frames that are no contexts.
+/// Lists the frames that are not context views.
 pub fn list(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Vec<TrueFrame>, ViewError> {
     let cameras = reader.source.cameras(index)?;
     let is_context = |frame: usize| scene.context_frames.contains(&(frame as u32));

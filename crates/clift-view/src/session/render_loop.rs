@@ -155,7 +155,7 @@ impl RenderLoop {
             frame: request.frame,
             camera: scene_camera(scene.origin.frames[request.frame].frame, &image.camera, [width, height]),
             tokens,
-            // Infinity is no JSON.
+            // JSON cannot represent infinity.
             psnr: psnr(&view.pixels, &target)?.min(100.0),
         };
         let true_png = if request.image { vec![png(&image.image)?] } else { Vec::new() };

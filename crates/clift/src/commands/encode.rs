@@ -185,7 +185,7 @@ fn cropped(image: [usize; 2], network: [usize; 2]) -> Option<[usize; 2]> {
     (0..2).any(|side| kept[side] * 10 < image[side] * 9).then_some(kept)
 }
 
-/// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
+/// Prints how a frame that is not a context view is rendered, with a warning if a copy of a context view is nearer to it.
 fn print_check(check: Option<HeldOutFrame>, model: &Path, names: &[String]) -> anyhow::Result<()> {
     let Some(HeldOutFrame { frame, psnr, nearest_psnr }) = check else {
         return print_result("check: no frame beside the contexts to compare a rendering with");

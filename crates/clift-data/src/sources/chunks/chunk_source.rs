@@ -93,7 +93,7 @@ impl ChunkSource {
     /// Scenes of missing chunks, and with filters unreadable scenes, are skipped and reported with the error.
     ///
     /// # Errors
-    /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is no map from keys to files
+    /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is not a map from keys to files
     /// beside it, [`DataError::BadConfig`] for invalid filters, and the error of the first chunk if every chunk fails.
     pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
         let folder = root.join(split.to_string());

@@ -65,7 +65,7 @@ impl Builder<'_> {
     fn add(&mut self, scene: &Value) -> Result<(), String> {
         let Self { pickle, archive, .. } = *self;
         let item = |name: &str| pickle.item(scene, name).ok_or_else(|| format!("no entry `{name}`"));
-        let Value::Str(key) = item("key")? else { return Err("`key` is no string".into()) };
+        let Value::Str(key) = item("key")? else { return Err("`key` is not a string".into()) };
         let in_scene = |what: String| format!("key {key:?}: {what}");
         if self.scenes.contains_key(key) {
             return Err(in_scene("it occurs twice".into()));
@@ -78,7 +78,7 @@ impl Builder<'_> {
         if self.url_bytes > MAX_BYTES {
             return Err(in_scene(format!("the `url`s so far have more than the limit of {MAX_BYTES} bytes")));
         }
-        let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is no list".into())) };
+        let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is not a list".into())) };
         self.num_frames += image_ids.len();
         if self.num_frames > MAX_FRAMES {
             return Err(in_scene(format!("the scenes so far have more than the limit of {MAX_FRAMES} frames")));

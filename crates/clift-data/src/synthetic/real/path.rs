@@ -20,7 +20,7 @@ const GLANCE: usize = 6;
 /// then begin at any pixel, as those of shifted patch grids do.
 const OFF_CENTER: f32 = 1.0 / 32.0;
 
-/// Where a camera may go.
+/// Region that a camera path may enter.
 pub(crate) struct Area {
     /// Middle and half sizes of the box in which a path starts (y is down).
     pub center: Vec3,

@@ -37,7 +37,7 @@ impl Exposure {
     }
 }
 
-/// What is seen of one surface in a block of 2 x 2 pixels.
+/// Visible part of one surface in a block of 2 x 2 pixels.
 #[derive(Clone, Copy)]
 struct Part {
     number: usize,

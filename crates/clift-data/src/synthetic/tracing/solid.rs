@@ -45,7 +45,7 @@ impl Rays {
     }
 }
 
-/// Where four lines enter and leave a solid; a line misses it where `near > far`.
+/// Distances at which four lines enter and leave a solid; a line misses it if `near > far`.
 #[derive(Clone, Copy)]
 pub(crate) struct Spans {
     pub near: Vec4,

@@ -19,7 +19,7 @@ const MAX_TURN_DEG: f64 = 1.0;
 /// Columns and rows of every frame, `None` for an unreadable frame.
 pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
 
-/// What the checks need of a decoded image.
+/// Features of a decoded image that the checks use.
 struct SeenImage {
     size: [usize; 2],
     hash: u64,

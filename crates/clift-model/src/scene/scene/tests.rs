@@ -291,10 +291,10 @@ fn only_scene_files_are_overwritten() {
     #[cfg(unix)]
     std::os::unix::fs::symlink(folder.path(), folder.0.path().join("link.clift")).unwrap();
     for (name, expected) in [
-        ("model.safetensors", "the existing file is no scene, and only scenes are overwritten; choose another name"),
-        (".", "is no regular file"),
+        ("model.safetensors", "the existing file is not a scene, and only scenes are overwritten; choose another name"),
+        (".", "is not a regular file"),
         #[cfg(unix)]
-        ("link.clift", "is no regular file"),
+        ("link.clift", "is not a regular file"),
         ("no/room.clift", "no folder "),
         ("room.clift/room.clift", "no folder "),
     ] {

@@ -36,7 +36,7 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     if size != [width, height] && width > 0 && height > 0 {
         let (size, patch) = (format!("{}x{}", size[0], size[1]), patch_size());
         print_warning(format!(
-            "{size} is no multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
+            "{size} is not a multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
         ));
     }
     for &split in args.split.list() {
