@@ -75,13 +75,13 @@ pub use tokens::selection::token_ray::TokenRay;
 // Networks
 pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
 pub use network::camera_encoding::TokenTransforms;
+pub use network::config::{CondenserConfig, ModelConfig};
+pub use network::init::Init;
 pub use network::model::Clift;
 pub use network::parts::condenser::Condenser;
 pub use network::parts::encoder::Encoder;
 pub use network::parts::renderer::Renderer;
 pub use network::pass::{Pass, PassState, TokenStep};
-pub use network::config::{CondenserConfig, ModelConfig};
-pub use network::init::Init;
 pub use network::render_tokens::{KeyValueCache, RenderTokens};
 pub use network::tokens::Tokens;
 // Layers and operations of the networks

@@ -1,5 +1,7 @@
 //! Rendering methods: own methods, two baselines, and external methods by name.
 
+use std::str::FromStr;
+
 use clift_model::{Architecture, Grouping};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -130,6 +132,15 @@ impl<'de> Deserialize<'de> for MethodName {
     }
 }
 
+impl FromStr for Method {
+    type Err = EvalError;
+
+    fn from_str(name: &str) -> Result<Self, EvalError> {
+        let own = Self::own().find(|method| method.name() == name);
+        own.map_or_else(|| MethodName::new(name).map(Self::External), Ok)
+    }
+}
+
 impl Serialize for Method {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(self.name())
@@ -138,11 +149,7 @@ impl Serialize for Method {
 
 impl<'de> Deserialize<'de> for Method {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let name = String::deserialize(deserializer)?;
-        match Self::own().find(|method| method.name() == name) {
-            Some(method) => Ok(method),
-            None => MethodName::new(&name).map(Self::External).map_err(serde::de::Error::custom),
-        }
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 

@@ -2,20 +2,8 @@
 
 use std::fmt;
 
-use crate::statistics::compare::{Comparison, MetricDifference, PairedRow, RowKey};
-
-impl fmt::Display for RowKey {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { method, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
-        f.write_str(method)?;
-        match (stored, stored == rendered) {
-            (0, _) => {}
-            (_, true) => write!(f, " {stored}")?,
-            (_, false) => write!(f, " {rendered} of {stored}")?,
-        }
-        if tokens.is_empty() { Ok(()) } else { write!(f, " {tokens}") }
-    }
-}
+use crate::statistics::compare::{Comparison, PairedRow};
+use crate::statistics::metric_difference::MetricDifference;
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -55,7 +43,7 @@ impl fmt::Display for Comparison {
         }
         for (side, keys) in [("A", &self.only_a), ("B", &self.only_b)] {
             if !keys.is_empty() {
-                let keys = keys.iter().map(RowKey::to_string).collect::<Vec<_>>().join(", ");
+                let keys = keys.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
                 writeln!(f, "Only in {side}, not compared: {keys}.")?;
             }
         }

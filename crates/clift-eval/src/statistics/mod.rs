@@ -4,6 +4,7 @@
 //! - `eval_results`: metrics of every view
 //! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front
+//! - `metric_difference`: paired differences of views, with confidence intervals
 //! - `paired`: paired differences of methods
 //! - `scene_scores`: scenes from worst to best
 //! - `summary`: summary.json
@@ -18,6 +19,7 @@ pub(crate) mod compare_table;
 pub(crate) mod csv_files;
 pub(crate) mod eval_results;
 pub(crate) mod headline;
+pub(crate) mod metric_difference;
 pub(crate) mod paired;
 pub(crate) mod pareto;
 pub(crate) mod scene_scores;

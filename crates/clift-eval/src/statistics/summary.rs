@@ -16,7 +16,9 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::view_metrics::{Cost, EvalKey, PSNR_CAP_DB, ViewMetrics, best_method};
+use crate::statistics::view_metrics::{
+    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SSIM, ViewMetrics, best_method, view_mean,
+};
 
 /// Means of a baseline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -203,16 +205,16 @@ pub(crate) fn context_targets_note(num_given: usize) -> Option<String> {
 }
 
 /// Returns the mean over the views of each scene, for the scenes that have a value.
-fn scene_means(views: &SceneViews, value: fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
-    views.values().filter_map(|frames| mean(&frames.values().filter_map(value).collect::<Vec<_>>())).collect()
+fn scene_means(views: &SceneViews, metric: Metric) -> Vec<f64> {
+    views.values().filter_map(|frames| view_mean(frames, metric)).collect()
 }
 
 impl Quality {
     fn new(views: &SceneViews) -> Self {
         Self {
-            psnr: mean(&scene_means(views, |view| Some(view.capped_psnr()))),
-            ssim: mean(&scene_means(views, |view| view.ssim)),
-            lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
+            psnr: mean(&scene_means(views, PSNR)),
+            ssim: mean(&scene_means(views, SSIM)),
+            lpips_vgg: mean(&scene_means(views, LPIPS)),
             num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
         }
     }
@@ -222,22 +224,20 @@ impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
         let Quality { psnr, ssim, lpips_vgg, num_identical_views } = Quality::new(scenes);
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
-        let values = |value: fn(&ViewMetrics) -> Option<f64>| -> Vec<f64> {
-            views.iter().filter_map(|view| value(view)).collect()
-        };
+        let per_view = |metric: Metric| mean(&views.iter().filter_map(|view| metric(view)).collect::<Vec<_>>());
         let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
         let (render_s, select_s, frame_s) = timed(results, key);
         Self {
             key,
             num_views: views.len(),
             psnr,
-            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(view.capped_psnr()))),
-            psnr_per_view: mean(&values(|view| Some(view.capped_psnr()))),
+            psnr_stderr: standard_error(&scene_means(scenes, PSNR)),
+            psnr_per_view: per_view(PSNR),
             num_identical_views,
             ssim,
-            ssim_per_view: mean(&values(|view| view.ssim)),
+            ssim_per_view: per_view(SSIM),
             lpips_vgg,
-            lpips_vgg_per_view: mean(&values(|view| view.lpips_vgg)),
+            lpips_vgg_per_view: per_view(LPIPS),
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
             render_p95_s: statistic(&render_s, p95),
@@ -265,7 +265,7 @@ fn timed(results: &EvalResults, key: EvalKey) -> (Vec<f64>, Vec<f64>, Vec<f64>) 
     };
     let views = results.views().filter(|(other, _)| is_same(*other)).flat_map(|(_, scenes)| scenes.values());
     let views: Vec<&ViewMetrics> = views.flat_map(BTreeMap::values).collect();
-    let values = |value: fn(&ViewMetrics) -> Option<f64>| views.iter().filter_map(|view| value(view)).collect();
+    let values = |metric: Metric| views.iter().filter_map(|view| metric(view)).collect();
     (values(|view| view.render_s), values(|view| view.select_s), values(ViewMetrics::frame_s))
 }
 
