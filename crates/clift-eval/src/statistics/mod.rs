@@ -10,6 +10,7 @@
 //! - `summary`: summary.json
 //! - `headline`: the result in a few lines
 //! - `csv_files`: views.csv and scenes.csv
+//! - `text_table`: aligned columns
 //! - `table`: the terminal table
 //! - `compare`: two evaluations, view by view
 //! - `compare_table`: its terminal table
@@ -26,4 +27,5 @@ pub(crate) mod scene_scores;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;
+pub(crate) mod text_table;
 pub(crate) mod view_metrics;

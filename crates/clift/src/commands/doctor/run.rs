@@ -3,14 +3,13 @@
 use std::path::PathBuf;
 
 use clift_bench::{DeviceCheck, Gradient, probe};
-use clift_eval::machine_rows;
+use clift_eval::{machine_rows, table};
 use clift_model::{DeviceName, InstructionSet, Precision};
 
 use crate::commands::args::parse::parse_output;
 use crate::commands::doctor::{adapters, stability};
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 
 /// Largest accepted difference of a gradient over its largest entry: orders of sums differ by 1e-6, wrong kernels by 1.
 const TOLERANCE: f64 = 1e-3;
