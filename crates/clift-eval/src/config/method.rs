@@ -2,6 +2,7 @@
 
 use std::str::FromStr;
 
+use arrayvec::ArrayString;
 use clift_model::{Architecture, Grouping};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -90,11 +91,7 @@ impl Method {
 
 /// Name of an external method, in place: a [`Method`] is copied as often as a number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct MethodName {
-    /// UTF-8, followed by zeros.
-    bytes: [u8; MAX_NAME * MAX_CHAR_BYTES],
-    num_bytes: usize,
-}
+pub struct MethodName(ArrayString<{ MAX_NAME * MAX_CHAR_BYTES }>);
 
 impl MethodName {
     /// Checks a name: 1 to 40 printable characters, not the name of an own method.
@@ -109,26 +106,12 @@ impl MethodName {
         if Method::own().any(|own| own.name() == name) {
             return Err(bad("reserved for a method of clift; choose another name"));
         }
-        let mut bytes = [0; MAX_NAME * MAX_CHAR_BYTES];
-        bytes[..name.len()].copy_from_slice(name.as_bytes());
-        Ok(Self { bytes, num_bytes: name.len() })
+        ArrayString::from(name).map(Self).map_err(|_| bad("use 1 to 40 printable characters"))
     }
 
     /// Returns the name.
     pub fn as_str(&self) -> &str {
-        str::from_utf8(&self.bytes[..self.num_bytes]).unwrap_or_default()
-    }
-}
-
-impl Serialize for MethodName {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.as_str())
-    }
-}
-
-impl<'de> Deserialize<'de> for MethodName {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        Self::new(&String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
+        self.0.as_str()
     }
 }
 

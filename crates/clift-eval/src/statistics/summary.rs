@@ -20,7 +20,7 @@ use crate::statistics::view_metrics::{
     Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SSIM, ViewMetrics, best_method, view_mean,
 };
 
-/// Means of a baseline.
+/// Means over the views of a scene, then over scenes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
     /// Mean over scenes of the scene's mean PSNR, in dB.
@@ -50,20 +50,15 @@ pub struct SummaryPoint {
     pub key: EvalKey,
     /// Measured views; below the views of the evaluation only for an external method with missing images.
     pub num_views: usize,
-    /// Mean over scenes of the scene's mean PSNR, in dB.
-    pub psnr: Option<f64>,
+    /// Means over the views of a scene, then over scenes.
+    #[serde(flatten)]
+    pub quality: Quality,
     /// Standard error of `psnr` over scenes; `null` for a single scene.
     pub psnr_stderr: Option<f64>,
     /// Mean PSNR over all views, in dB. Equals `psnr` if all scenes have the same number of views.
     pub psnr_per_view: Option<f64>,
-    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
-    pub num_identical_views: usize,
-    /// Mean over scenes of the scene's mean SSIM.
-    pub ssim: Option<f64>,
     /// Mean SSIM over all views.
     pub ssim_per_view: Option<f64>,
-    /// Mean over scenes of the scene's mean LPIPS.
-    pub lpips_vgg: Option<f64>,
     /// Mean LPIPS over all views.
     pub lpips_vgg_per_view: Option<f64>,
     /// Mean rendering time per view, in seconds.
@@ -140,8 +135,8 @@ impl Summary {
             .collect();
         let scenes: BTreeSet<&str> = views.iter().map(|(scene, _)| *scene).collect();
         let quality = |method| results.of(EvalKey::baseline(method)).map(Quality::new).unwrap_or_default();
-        let missing = results.missing.iter().map(|(&name, images)| MissingImages {
-            method: Method::External(name),
+        let missing = results.missing.iter().map(|(&method, images)| MissingImages {
+            method,
             num_missing: images.len(),
             images: images.iter().cloned().collect(),
         });
@@ -222,7 +217,6 @@ impl Quality {
 
 impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
-        let Quality { psnr, ssim, lpips_vgg, num_identical_views } = Quality::new(scenes);
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
         let per_view = |metric: Metric| mean(&views.iter().filter_map(|view| metric(view)).collect::<Vec<_>>());
         let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
@@ -230,13 +224,10 @@ impl SummaryPoint {
         Self {
             key,
             num_views: views.len(),
-            psnr,
+            quality: Quality::new(scenes),
             psnr_stderr: standard_error(&scene_means(scenes, PSNR)),
             psnr_per_view: per_view(PSNR),
-            num_identical_views,
-            ssim,
             ssim_per_view: per_view(SSIM),
-            lpips_vgg,
             lpips_vgg_per_view: per_view(LPIPS),
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
@@ -271,7 +262,8 @@ fn timed(results: &EvalResults, key: EvalKey) -> (Vec<f64>, Vec<f64>, Vec<f64>) 
 
 fn mark_fronts(points: &mut [SummaryPoint]) {
     let of = |points: &[SummaryPoint], cost: fn(&SummaryPoint) -> Option<[f64; 2]>| {
-        let position = |point: &SummaryPoint| (cost(point).unwrap_or([f64::NAN; 2]), point.psnr.unwrap_or(f64::NAN));
+        let position =
+            |point: &SummaryPoint| (cost(point).unwrap_or([f64::NAN; 2]), point.quality.psnr.unwrap_or(f64::NAN));
         pareto_front(&points.iter().map(position).collect::<Vec<_>>())
     };
     for i in of(points, |point| point.frame_quartiles_s) {
@@ -306,8 +298,8 @@ mod tests {
             (&[("a", 0, f64::INFINITY), ("b", 0, 20.0)], 60.0, 60.0, Some(40.0), 1),
         ] {
             let point = Summary::new(&results(views)).points.remove(0);
-            assert_eq!((point.psnr, point.psnr_per_view), (Some(psnr), Some(psnr_per_view)));
-            assert_eq!((point.psnr_stderr, point.num_identical_views), (psnr_stderr, num_identical));
+            assert_eq!((point.quality.psnr, point.psnr_per_view), (Some(psnr), Some(psnr_per_view)));
+            assert_eq!((point.psnr_stderr, point.quality.num_identical_views), (psnr_stderr, num_identical));
         }
         // Sums of these values depend on their order in the last bit.
         let mut views = [("a", 0, 20.1), ("a", 1, 22.7), ("a", 2, 1e-9), ("b", 0, 30.3), ("c", 5, 17.77)];

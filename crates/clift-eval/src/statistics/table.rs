@@ -90,10 +90,10 @@ fn point_cells(point: &SummaryPoint) -> [String; HEADER.len()] {
         count(point.key.num_storage_tokens),
         count(point.key.num_render_tokens),
         point.key.tokens.map_or_else(|| cell(None, 0), |tokens| tokens.to_string()),
-        cell(point.psnr, 2),
+        cell(point.quality.psnr, 2),
         cell(point.psnr_stderr, 2),
-        cell(point.ssim, 3),
-        cell(point.lpips_vgg, 3),
+        cell(point.quality.ssim, 3),
+        cell(point.quality.lpips_vgg, 3),
         ms(point.render_median_s),
         ms(point.frame_median_s),
         quartiles.unwrap_or_else(|| cell(None, 0)),
@@ -133,7 +133,7 @@ mod tests {
         let name = MethodName::new("DepthSplat").unwrap();
         let other = EvalKey::baseline(Method::External(name));
         views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
-        views.record_missing_image(name, "b/000000.png".into());
+        views.record_missing_image(other.method, "b/000000.png".into());
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         let cost =
             Cost { gflops: Some(45.23), scene_values: Some(49_152), scene_bytes: Some(99_000), ..Cost::default() };

@@ -131,9 +131,9 @@ impl<'a> Validation<'a> {
         };
         let summary = Summary::new(&measured);
         let Some(point) = summary.points.first() else { return Ok(None) };
-        let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
+        let (psnr, ssim) = (point.quality.psnr.unwrap_or(f64::NAN), point.quality.ssim);
         sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
-        Ok(point.psnr.filter(|psnr| psnr.is_finite()))
+        Ok(point.quality.psnr.filter(|psnr| psnr.is_finite()))
     }
 
     /// Evaluates models on the views of this validation, the scenes shared by the ranks.
