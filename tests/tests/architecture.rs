@@ -7,48 +7,51 @@ use crate::support::{repository, sources};
 /// A crate, the crates that it may use, and its folders and root files: each imports only those that stand before it.
 type Crate = (&'static str, &'static str, &'static str);
 
-const CRATES: [Crate; 8] = [
+const CRATES: [Crate; 9] = [
+    ("clift-core", "", "error statistics random rgb_image files geometry clip_views"),
     (
         "clift-kernels",
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    (
-        "clift-model",
-        "clift-kernels",
-        "error names atomic_files device ops views tokens network cost weights codec scene",
-    ),
+    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights codec scene"),
     (
         "clift-data",
-        "",
-        "bad_config error statistics random skip_report files geometry image torch scene_source synthetic sources sampling config \
+        "clift-core",
+        "error skip_report files geometry image torch scene_source synthetic sources sampling config \
          tools dataset",
     ),
     (
         "clift-eval",
-        "clift-kernels clift-model clift-data",
-        "error system config metrics upload statistics encode sweep figures report evaluator codec",
+        "clift-core clift-kernels clift-model clift-data",
+        "error system config metrics statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",
-        "clift-kernels clift-model clift-data clift-eval",
-        "error version distributed events config step cluster_cache interchange stage checkpoint footprint fit_token_codec run",
+        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "error version distributed events config step cluster_cache interchange stage checkpoint footprint \
+         fit_token_codec run",
     ),
     (
         "clift-bench",
-        "clift-kernels clift-model clift-data clift-eval clift-train",
+        "clift-core clift-kernels clift-model clift-data clift-eval clift-train",
         "allreduce cases data_reading runner precision doctor",
     ),
-    ("clift-view", "clift-kernels clift-model clift-data clift-eval", "error protocol scenes session server"),
+    (
+        "clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "error protocol scenes session server",
+    ),
     (
         "clift",
-        "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
         "interrupt exit_code output threads commands cli reference_pages",
     ),
 ];
 
-const MAX_FILES: usize = 15;
-const MAX_LINES: usize = 400;
+/// Lines of production code in a file: one idea fits in fewer than the first number, and no file has more than the second.
+const LONG: usize = 450;
+const MAX_LINES: usize = 600;
 
 #[test]
 fn sources_keep_the_layout() {
@@ -73,13 +76,6 @@ type Modules<'a> = BTreeMap<String, Module<'a>>;
 /// What breaks a rule, as `path:line: what`.
 fn violations(sources: &Sources) -> Vec<String> {
     let mut found = Vec::new();
-    let mut files_of = BTreeMap::<&str, usize>::new();
-    for (folder, _) in sources.keys().filter_map(|path| path.strip_suffix(".rs")?.rsplit_once('/')) {
-        *files_of.entry(folder).or_default() += 1;
-    }
-    for (folder, count) in files_of.into_iter().filter(|(_, count)| *count > MAX_FILES) {
-        found.push(format!("{folder}:1: {count} source files, more than {MAX_FILES}"));
-    }
     for (name, uses, order) in CRATES {
         check_dependencies(name, uses, sources, &mut found);
         let root = format!("crates/{name}/src/");
@@ -174,6 +170,8 @@ fn check_file(name: &str, module: &Module, modules: &Modules, found: &mut Vec<St
     let num_lines = module.text.lines().zip(&module.code).filter(is_production).count();
     if num_lines > MAX_LINES {
         add(1, format!("{num_lines} lines of production code, more than {MAX_LINES}"));
+    } else if num_lines > LONG {
+        eprintln!("warning: {} has {num_lines} lines of production code: is it one idea?", module.path);
     }
     if name.rsplit_once("::").is_some_and(|(folder, _)| modules.get(folder).is_none_or(|page| !page.is_folder())) {
         add(1, "its folder has no mod.rs".into());
@@ -329,7 +327,7 @@ fn small_tree(changes: &[(&str, &str)]) -> Sources {
 #[test]
 fn each_rule_reports_file_and_line() {
     assert_eq!(violations(&small_tree(&[])), [] as [&str; 0]);
-    let long = "fn f() {}\n".repeat(401);
+    let long = "fn f() {}\n".repeat(601);
     for (path, text, expected) in [
         ("Cargo.toml", "\n[dependencies]\nclift-data = {}\n", "3: clift-model does not stand above clift-data"),
         ("src/lib.rs", "pub mod error;\npub use crate::error::ModelError;\n", "1: a public module of a crate"),
@@ -338,7 +336,7 @@ fn each_rule_reports_file_and_line() {
         ("src/other.rs", "use crate::error::ModelError;\n", "1: other does not stand behind error"),
         ("src/network/block.rs", "\nuse super::{\n    Model,\n};\n", "2: network::block is in a circle"),
         ("src/network/block.rs", "use crate::ModelError;\n", "1: `ModelError` is in no file"),
-        ("src/network/block.rs", &long, "1: 401 lines of production code, more than 400"),
+        ("src/network/block.rs", &long, "1: 601 lines of production code, more than 600"),
         ("src/network/mod.rs", "mod block;\n", "1: a mod.rs without a page"),
         ("src/network/mod.rs", "//! A page.\nmod block;\npub struct Model;\n", "3: code in a mod.rs"),
         ("src/scene/read.rs", "", "1: its folder has no mod.rs"),
@@ -347,8 +345,4 @@ fn each_rule_reports_file_and_line() {
         let expected = format!("crates/clift-model/{path}:{expected}");
         assert!(found.iter().any(|one| one.starts_with(&expected)), "{expected}: {found:?}");
     }
-    let many: Vec<String> = (0..14).map(|i| format!("src/network/file{i}.rs")).collect();
-    let many: Vec<(&str, &str)> = many.iter().map(|path| (path.as_str(), "")).collect();
-    let full = violations(&small_tree(&many));
-    assert_eq!(full, ["crates/clift-model/src/network:1: 17 source files, more than 15"]);
 }

@@ -4,43 +4,39 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::support::{BINARY, finish, repository, start};
+use crate::support::{BINARY, Place, finish, repository, start};
 
-/// The examples with their arguments and a part of their output. `REPO` is the repository, `DIR` a temporary folder, `image`
-/// a photo. An example may read what one before it wrote.
+/// The examples with their arguments and a part of their output. `REPO` is the repository, `DIR` a temporary folder with the
+/// photos of a scene. An example may read what one before it wrote.
 const EXAMPLES: [(&str, &[&str], &str); 6] = [
     ("custom_source", &[], "wall: 3 context views, 1 target view"),
-    ("fit_frame", &["16x16", "image", "DIR/fitted.png"], ""),
     ("synthetic_sheet", &["DIR/sheet.png"], "us per frame of 64 x 64"),
+    ("fit_frame", &["16x16", "DIR/sheet.png", "DIR/fitted.png"], ""),
     ("custom_loss", &[], "step 20: loss "),
-    ("encode_and_render", &["REPO/models/rooms", "REPO/data-fixtures/layouts/colmap_txt/attic", "DIR/attic"], " dB"),
-    ("read_scene", &["DIR/attic.clift"], "context views of 64 x 64"),
+    ("encode_and_render", &["REPO/models/rooms", "DIR/photos", "DIR/scene"], "the nearest context view"),
+    ("read_scene", &["DIR/scene.clift"], "4 context views of 64 x 64"),
 ];
-const IMAGE: &str = "data-fixtures/layouts/colmap_bin/attic/images/left/frame 9.png";
-const WRITTEN: [&str; 4] = ["fitted.png", "sheet.png", "attic.clift", "attic.png"];
+const WRITTEN: [&str; 4] = ["fitted.png", "sheet.png", "scene.clift", "scene.png"];
 
 #[test]
 fn every_example_runs() {
     let listed: BTreeSet<String> = EXAMPLES.iter().map(|(name, ..)| (*name).to_owned()).collect();
     assert_eq!(names(), listed, "EXAMPLES lists every example");
     let built = Path::new(BINARY).parent().expect("a folder").join("examples");
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let place = Place::new();
+    place.clift("data synth DIR/photos --look real --scenes 1 --frames 16 --size 64x64").ok();
     for (name, words, expected) in EXAMPLES {
         let binary = built.join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
         assert!(binary.is_file(), "{}: `cargo test --release --workspace` builds it", binary.display());
-        let argument = |word: &&str| match *word {
-            "image" => repository(IMAGE),
-            word => match word.split_once('/') {
-                Some(("REPO", path)) => repository(path),
-                Some(("DIR", path)) => folder.path().join(path),
-                _ => PathBuf::from(word),
-            },
+        let argument = |word: &&str| match word.split_once('/') {
+            Some(("REPO", path)) => repository(path),
+            Some(("DIR", path)) => place.at(path),
+            _ => PathBuf::from(word),
         };
         finish(start(Command::new(binary).args(words.iter().map(argument)))).ok().prints(expected);
     }
     for name in WRITTEN {
-        let size = folder.path().join(name).metadata().map(|file| file.len());
-        assert!(size.is_ok_and(|size| size > 0), "{name} is written");
+        assert!(place.at(name).metadata().is_ok_and(|file| file.len() > 0), "{name} is written");
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use clift_data::{median, p95};
+use clift_core::{median, p95};
 use clift_train::{Ranks, TrainError, sent_bytes};
 use serde::Serialize;
 

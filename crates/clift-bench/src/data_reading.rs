@@ -3,10 +3,8 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use clift_data::{
-    BadConfig, ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, median, p95,
-    sample_distinct, uniform_below,
-};
+use clift_core::{BadConfig, item_rng, median, p95, sample_distinct, uniform_below};
+use clift_data::{ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices};
 use serde::Serialize;
 
 const NUM_PREFETCH: usize = 8;
@@ -142,7 +140,8 @@ fn sample_frames(num_frames: usize, [num_context, num_targets]: [usize; 2], rng:
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{PoseRotation, PoseScale, SyntheticConfig, SyntheticSource};
+    use clift_core::{PoseRotation, PoseScale};
+    use clift_data::{SyntheticConfig, SyntheticSource};
 
     use super::*;
 

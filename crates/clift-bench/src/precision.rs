@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_data::{BadConfig, median};
+use clift_core::{BadConfig, median};
 use clift_eval::psnr_of_mse;
 use clift_model::{DeviceName, Precision};
 use clift_train::{Config, Stage, TrainError, freeze};
@@ -25,7 +25,7 @@ pub const PRECISION_CASES: [BenchCase; 4] =
 pub struct PrecisionReport {
     /// Device of the tensors.
     pub device: DeviceName,
-    /// What f32 is compared with.
+    /// Precision compared with f32.
     pub precision: Precision,
     /// One row per case.
     pub rows: Vec<PrecisionRow>,

@@ -5,7 +5,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_data::{median, p95};
+use clift_core::{median, p95};
 use clift_eval::{peak_bytes, start_peak};
 use clift_model::{DeviceName, Precision};
 use clift_train::{Config, Stage, TrainError};

@@ -9,10 +9,8 @@
 
 use std::sync::Arc;
 
-use clift_data::{
-    Camera, ClipOptions, ClipReader, DVec3, DataError, IntrinsicsNorm, Pose, PoseRotation, PoseScale, RgbImage,
-    SceneSource, ViewIndices,
-};
+use clift_core::{Camera, DVec3, IntrinsicsNorm, Pose, PoseRotation, PoseScale, RgbImage};
+use clift_data::{ClipOptions, ClipReader, DataError, SceneSource, ViewIndices};
 
 struct Wall;
 
@@ -30,10 +28,10 @@ impl SceneSource for Wall {
     }
 
     /// Poses are camera to world, OpenCV axes. Intrinsics are relative to the width and height of the image.
-    fn cameras(&self, _scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, _scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.5, fy: 0.5, cx: 0.5, cy: 0.5 };
         let c2w = |frame: u32| Pose { translation: 0.1 * f64::from(frame) * DVec3::X, ..Pose::IDENTITY };
-        Ok((0..8).map(|frame| Camera { intrinsics_norm, c2w: c2w(frame) }).collect())
+        Ok((0..8).map(|frame| Camera { intrinsics: intrinsics_norm, c2w: c2w(frame) }).collect())
     }
 
     fn frame(&self, _scene: usize, frame: usize) -> Result<RgbImage, DataError> {

@@ -4,7 +4,8 @@
 
 use std::error::Error;
 
-use clift_data::{IntrinsicsNorm, decode_image, encode_png, fit_image};
+use clift_core::IntrinsicsNorm;
+use clift_data::{decode_image, encode_png, fit_image};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut words = std::env::args().skip(1);

@@ -5,7 +5,8 @@
 use std::error::Error;
 use std::time::Instant;
 
-use clift_data::{Look, RgbImage, SceneSource, SyntheticConfig, SyntheticSource, encode_png};
+use clift_core::RgbImage;
+use clift_data::{Look, SceneSource, SyntheticConfig, SyntheticSource, encode_png};
 
 /// Cells along each side of the sheet.
 const CELLS: usize = 8;

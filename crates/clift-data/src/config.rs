@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
+use clift_core::{PoseRotation, PoseScale};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::normalization::{PoseRotation, PoseScale};
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
 use crate::sampling::view_sampler::ViewSampler;
@@ -37,7 +37,7 @@ pub struct DataConfig {
     pub crop: Crop,
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     pub flip: bool,
-    /// Where a data set has no test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
+    /// For data sets without a test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
     /// never read in training, as in the practice of `NeRF`; 0 holds out no frame, and training scenes are evaluated.
     pub hold_out: usize,
     /// Filters of the scenes on disk.

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use crate::bad_config::BadConfig;
 use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::sampling::clip_reader::ClipReader;
@@ -20,6 +19,7 @@ use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
+use clift_core::BadConfig;
 
 /// Opens one split of the data set of a config. `progress` is called with the numbers of examined and of all chunks while
 /// `data.filters` read the chunks: the first opening of a large data set can take minutes.
@@ -132,11 +132,11 @@ pub fn half_resolution_clips(config: &DataConfig, reader: &ClipReader) -> Result
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::item_rng;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
     use crate::testing::rooms;
+    use clift_core::item_rng;
 
     #[test]
     fn small_synthetic_clips_show_what_reduced_ones_show() {
@@ -153,8 +153,7 @@ mod tests {
         let (drawn, reduced) = read(&data);
         assert_eq!((drawn.key, drawn.target.width, drawn.target.height), (reduced.key, 16, 8));
         for (drawn, reduced) in [(&drawn.context, &reduced.context), (&drawn.target, &reduced.target)] {
-            assert_eq!((&drawn.c2w, &drawn.frame_index), (&reduced.c2w, &reduced.frame_index));
-            assert_eq!(drawn.intrinsics, reduced.intrinsics);
+            assert_eq!((&drawn.cameras, &drawn.frame_index), (&reduced.cameras, &reduced.frame_index));
             let differences = drawn.images.iter().zip(&reduced.images).map(|(a, b)| f64::from(a.abs_diff(*b)));
             let mean = differences.sum::<f64>() / drawn.images.len() as f64;
             assert!(mean < 4.0, "{mean} grey levels");

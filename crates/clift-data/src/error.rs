@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::bad_config::BadConfig;
+use clift_core::{BadConfig, CameraError};
 
 /// Error of this crate. A message states the problem, the expected and the found value, and the path last.
 #[derive(Debug, thiserror::Error)]
@@ -18,12 +18,9 @@ pub enum DataError {
         /// File.
         path: PathBuf,
     },
-    /// A camera holds a NaN or an infinity, or its rotation matrix is not orthonormal.
-    #[error("bad camera: {what}")]
-    BadCamera {
-        /// Problem and the value found.
-        what: String,
-    },
+    /// A camera cannot be used, or the cameras of a scene have no normalised frame.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
     /// A pickle is malformed, larger than the limits, or uses an opcode that `torch.save` does not write.
     #[error("bad pickle: {what}: {path}", path = path.display())]
     BadPickle {
@@ -40,7 +37,7 @@ pub enum DataError {
         /// Archive of the pickle.
         path: PathBuf,
     },
-    /// A chunk is truncated, is no ZIP archive, or violates the chunk format.
+    /// A chunk is truncated, is not a ZIP archive, or violates the chunk format.
     #[error("bad chunk: {what}: {path}", path = path.display())]
     BadChunk {
         /// Problem, with the scene key if known.
@@ -48,7 +45,7 @@ pub enum DataError {
         /// Chunk file.
         path: PathBuf,
     },
-    /// A PyTorch checkpoint is truncated, is no ZIP archive, or lacks a requested tensor.
+    /// A PyTorch checkpoint is truncated, is not a ZIP archive, or lacks a requested tensor.
     #[error("bad checkpoint: {what}: {path}", path = path.display())]
     BadCheckpoint {
         /// Problem, with the tensor's key if known.
@@ -130,7 +127,7 @@ pub enum DataError {
         /// Number of frames of the scene.
         num_frames: usize,
     },
-    /// An image file is no readable JPEG or PNG, or the image exceeds the size limit.
+    /// An image file is not a readable JPEG or PNG, or the image exceeds the size limit.
     #[error("frame {frame} of scene {key} cannot be decoded: {what}")]
     BadImage {
         /// Scene key.
@@ -163,27 +160,6 @@ pub enum DataError {
         from_width: usize,
         /// Rows of the image file.
         from_height: usize,
-    },
-    /// The camera centres that define a scene's scale coincide.
-    #[error(
-        "scene {key} has no baseline: {}; remove the scene or choose other frames",
-        match num_views {
-            1 => "it has one view, and at least two are needed".to_owned(),
-            _ => format!(
-                "its {num_views} camera centres lie within {extent:.3e} of their mean, below the resolution of f32 files, \
-                 {threshold:.3e}"
-            ),
-        }
-    )]
-    ZeroBaseline {
-        /// Scene key.
-        key: String,
-        /// Number of views that define the scale.
-        num_views: usize,
-        /// Largest distance from the mean centre along an axis, in world units.
-        extent: f64,
-        /// Smallest accepted extent, in world units.
-        threshold: f64,
     },
     /// A frame of a scene cannot be used.
     #[error("frame {frame} of scene {key}: {source}")]
@@ -252,9 +228,14 @@ pub struct WorkerPanic {
 }
 
 impl DataError {
+    /// Creates a [`CameraError::BadCamera`].
+    pub(crate) fn bad_camera(what: String) -> Self {
+        CameraError::BadCamera { what }.into()
+    }
+
     /// Returns a function that names the frame of an error, for `map_err`.
-    pub(crate) fn in_frame(key: &str, frame: usize) -> impl FnOnce(Self) -> Self {
-        move |source| Self::InFrame { key: key.to_owned(), frame, source: Box::new(source) }
+    pub(crate) fn in_frame<E: Into<Self>>(key: &str, frame: usize) -> impl FnOnce(E) -> Self {
+        move |source| Self::InFrame { key: key.to_owned(), frame, source: Box::new(source.into()) }
     }
 
     /// Returns a function that wraps an error of the operating system, for `map_err`.

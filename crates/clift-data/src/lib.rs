@@ -1,7 +1,7 @@
 //! Files in, clips out: data sets and captures in every layout, synthetic scenes, view samplers and the loader.
 //!
 //! A clip holds the context and target images of one scene with their normalised cameras. This crate does not depend on
-//! Burn: clips are plain host arrays, which `clift_model::Views::upload` copies to a device.
+//! Burn: clips are plain host arrays ([`ClipViews`](clift_core::ClipViews)), which `clift_model::Views::upload` copies to a device.
 //!
 //! ```
 //! use clift_data::{ClipReader, DataConfig, Split, ViewIndices, open_dataset};
@@ -16,19 +16,16 @@
 //! # Ok::<(), clift_data::DataError>(())
 //! ```
 
-mod bad_config;
 mod config;
 mod dataset;
 mod error;
 mod files;
 mod geometry;
 mod image;
-mod random;
 mod sampling;
 mod scene_source;
 mod skip_report;
 mod sources;
-mod statistics;
 mod synthetic;
 #[cfg(test)]
 mod testing;
@@ -36,7 +33,6 @@ mod tools;
 mod torch;
 
 // Opening a data set.
-pub use bad_config::{BadConfig, check_config};
 pub use config::DataConfig;
 pub use dataset::{half_resolution_clips, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
@@ -59,7 +55,7 @@ pub use synthetic::config::{Look, SyntheticConfig};
 pub use synthetic::source::SyntheticSource;
 
 // Clips and batches.
-pub use sampling::clip::{Clip, ClipViews, ViewIndices};
+pub use sampling::clip::{Clip, ViewIndices};
 pub use sampling::clip_reader::{ClipOptions, ClipReader};
 pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views, even_views_of};
 pub use sampling::inner_views::InnerViews;
@@ -68,21 +64,15 @@ pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
 pub use sampling::training_clips::{ReadClip, TrainingClips};
 pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
-// Cameras and poses.
-pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
-pub use geometry::camera_path::{PathView, focus_distance, interpolate_path, mean_intrinsics, orbit_path};
+// Lenses, files of poses, and measures on poses.
 pub use geometry::lens::Lens;
-pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
 pub use geometry::overlap::overlap;
 pub use geometry::path_spread::contexts_along_path;
-pub use geometry::pose::Pose;
 pub use geometry::pose_file::read_poses;
-pub use glam::{DMat3, DVec3};
 
 // Images.
 pub use image::codec::{decode_image, encode_jpeg, encode_png};
 pub use image::fit::{Crop, fit_image};
-pub use image::rgb_image::RgbImage;
 pub use image::undistort::Undistortion;
 
 // Tools for data sets: describe, check, convert, index.
@@ -99,9 +89,3 @@ pub use tools::overlap_index::{OverlapOptions, write_overlap_index};
 pub use torch::pickle::Pickle;
 pub use torch::state_dict::{StateDict, write_state_dict};
 pub use torch::values::ElementType;
-
-// Atomic writes, random streams and statistics, shared with the crates above.
-pub use files::atomic::{TEMPORARY, make_folder, publish_folder, remove_folder, remove_leftovers, replace_file};
-pub use files::staged_dir::{StagedDir, is_empty_folder};
-pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
-pub use statistics::{MinMedianMax, mean, median, p95, quartiles, standard_error};

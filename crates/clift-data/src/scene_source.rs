@@ -1,11 +1,10 @@
 //! The interface of every data source, and the two splits of a data set.
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
 use serde::{Deserialize, Serialize};
 use strum::Display;
 
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 
 /// One of the two splits of a data set. Prints as `train` or `test`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display)]
@@ -28,7 +27,7 @@ pub trait SceneSource: Send + Sync {
     /// Returns the index of the scene with this key.
     fn find(&self, key: &str) -> Option<usize>;
     /// Returns the cameras of a scene, in frame order.
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError>;
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError>;
     /// Returns the number of frames of a scene. The default reads the cameras.
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.cameras(scene)?.len())

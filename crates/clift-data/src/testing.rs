@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
+
 use crate::error::DataError;
 use crate::files::listing::file_names;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::filters::SceneFilters;
@@ -65,7 +65,8 @@ pub fn assert_same(a: &dyn SceneSource, b: &dyn SceneSource) {
     }
 }
 
-type ChangeCameras = dyn Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync;
+type ChangeCameras =
+    dyn Fn(usize, Vec<Camera<IntrinsicsNorm>>) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> + Send + Sync;
 type ChangeFrame = dyn Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync;
 type EncodedFrame = dyn Fn(usize, usize) -> Option<Vec<u8>> + Send + Sync;
 
@@ -89,7 +90,10 @@ impl TestSource {
 
     pub fn with_cameras(
         self,
-        change: impl Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync + 'static,
+        change: impl Fn(usize, Vec<Camera<IntrinsicsNorm>>) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError>
+        + Send
+        + Sync
+        + 'static,
     ) -> Self {
         Self { cameras: Box::new(change), ..self }
     }
@@ -129,7 +133,7 @@ impl SceneSource for TestSource {
         self.base.find(key)
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         (self.cameras)(scene, self.base.cameras(scene)?)
     }
 
@@ -168,7 +172,7 @@ impl SceneSource for Lengths {
         self.keys.iter().position(|other| other == key)
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         panic!("sampling views reads the cameras of scene {scene}, and reading the clip would again")
     }
 

@@ -1,6 +1,6 @@
 //! Conversions between camera conventions and back.
 
-use clift_data::{Camera, IntrinsicsNorm, Pose};
+use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 
@@ -16,10 +16,10 @@ fn pose() -> impl Strategy<Value = Pose> {
     (rotation(), centre).prop_map(|(rotation, translation)| Pose { rotation, translation })
 }
 
-fn camera() -> impl Strategy<Value = Camera> {
+fn camera() -> impl Strategy<Value = Camera<IntrinsicsNorm>> {
     let intrinsics = [0.2..3.0_f64, 0.2..3.0_f64, 0.2..0.8_f64, 0.2..0.8_f64];
     (intrinsics, pose())
-        .prop_map(|([fx, fy, cx, cy], c2w)| Camera { intrinsics_norm: IntrinsicsNorm { fx, fy, cx, cy }, c2w })
+        .prop_map(|([fx, fy, cx, cy], c2w)| Camera { intrinsics: IntrinsicsNorm { fx, fy, cx, cy }, c2w })
 }
 
 fn rows(pose: Pose) -> [[f64; 4]; 3] {
@@ -37,7 +37,7 @@ proptest! {
         let row = camera.to_re10k();
         let back = Camera::from_re10k(row).unwrap();
         prop_assert!(worst(&back.c2w.to_matrix_f64(), &camera.c2w.to_matrix_f64()) < 1e-11); // centres are up to 87 away
-        prop_assert_eq!(back.intrinsics_norm, camera.intrinsics_norm);
+        prop_assert_eq!(back.intrinsics, camera.intrinsics);
         prop_assert!(worst(&back.to_re10k(), &row) < 1e-11);
         prop_assert_eq!(&row[4..6], &[0.0, 0.0]);
         // The file holds w2c, which maps the camera centre to the origin.

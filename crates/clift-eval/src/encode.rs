@@ -1,14 +1,13 @@
 //! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
-use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
+use clift_core::{Pose, PoseNormalization, derive_seed};
+use clift_data::{ClipReader, DataError, ViewIndices, contexts_along_path};
 use clift_model::{
-    Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneNormalization, TokenCount, TokenKind,
-    TrainedModel,
+    Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, TokenCount, TokenKind, Tokens, TrainedModel, Views,
 };
 
 use crate::error::EvalError;
-use crate::upload::{host_values, upload_views, view_cameras};
 
 /// Settings of [`encode`].
 #[derive(Clone, Debug, PartialEq)]
@@ -66,7 +65,7 @@ impl EncodedScene {
 /// path, as [`encode`] does without [`EncodeOptions::context`].
 ///
 /// # Errors
-/// Those of the cameras, and [`DataError::ZeroBaseline`](clift_data::DataError::ZeroBaseline) for frames without a scale.
+/// Those of the cameras, and [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
 pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, EvalError> {
     let (context, _) = contexts(reader, scene, None, num_views)?;
     Ok(context)
@@ -88,7 +87,7 @@ pub fn encode(
     let views = ViewIndices { context, target: Vec::new() };
     let clip = reader.read(scene, &views)?;
 
-    let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
+    let lift = model.network.encode(&Views::upload(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
     let architecture = model.config.architecture;
@@ -125,9 +124,9 @@ pub fn encode(
         model_path: options.model_path.clone(),
         height: data.height,
         width: data.width,
-        context: view_cameras(&clip.context),
+        context: clip.context.cameras,
         context_frames: views.context.iter().map(|&frame| frame as u32).collect(),
-        world: SceneNormalization { mean_c2w: frame.mean_c2w.to_matrix_f64(), scale: frame.scale },
+        world: frame,
         token_ids,
         tokens,
     };
@@ -145,7 +144,8 @@ fn contexts(
     let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
     let frames = context_frames(&poses, requested, num_views)?;
     let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
+    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)
+        .map_err(DataError::from)?;
     Ok((frames, normalization))
 }
 
@@ -170,6 +170,11 @@ fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize)
         return Err(bad(list, format!("there is no frame {frame}; the scene has frames 0 to {last}")));
     }
     Ok(requested.to_vec())
+}
+
+/// Returns the values of tokens, `[1, S, D]`, on the host.
+pub(crate) fn host_values(tokens: &Tokens) -> Result<Vec<f32>, EvalError> {
+    tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
 }
 
 fn bad_config(key: &'static str, value: String, fix: String) -> EvalError {

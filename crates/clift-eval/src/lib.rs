@@ -33,14 +33,12 @@ mod sweep;
 mod system;
 #[cfg(test)]
 mod testing;
-mod upload;
 
 // Errors of all functions.
 pub use error::EvalError;
 
-// Encode images; clips as tensors.
+// Encode images.
 pub use encode::{EncodeOptions, EncodedScene, encode, spread_contexts};
-pub use upload::{upload_cameras, upload_images, upload_views, view_cameras};
 
 // Metrics and the perceptual loss.
 pub use metrics::image_metrics::{psnr, psnr_of_mse, ssim};

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
-use clift_data::{ClipViews, Intrinsics, Pose};
+use clift_core::{Camera, ClipViews, Intrinsics, Pose};
 use clift_model::TokenCoding;
 use safetensors::{Dtype, SafeTensors};
 
@@ -74,8 +74,7 @@ pub fn gray_views((width, height): (usize, usize), level: u8, c2w: Vec<Pose>, fr
         width,
         height,
         images: vec![level; frame_index.len() * height * width * 3],
-        intrinsics: vec![intrinsics; c2w.len()],
-        c2w,
+        cameras: c2w.into_iter().map(|c2w| Camera { c2w, intrinsics }).collect(),
         frame_index,
     }
 }

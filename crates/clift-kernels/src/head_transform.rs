@@ -63,7 +63,7 @@ pub const fn transform_len(head_width: usize) -> usize {
 /// - `x`: `[num_tokens, parts, num_heads, head_width]`
 ///
 /// # Panics
-/// If `head_width` is no multiple of eight, or the lengths differ from the shapes.
+/// If `head_width` is not a multiple of eight, or the lengths differ from the shapes.
 pub fn transform_heads(
     set: InstructionSet,
     parts: &[HeadTransform],

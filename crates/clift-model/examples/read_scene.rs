@@ -19,10 +19,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         scene.height
     );
     for (frame, camera) in scene.context_frames.iter().zip(&scene.context) {
-        println!("frame {frame}: [fx, fy, cx, cy] = {:?}", camera.intrinsics);
+        println!("frame {frame}: [fx, fy, cx, cy] = {:?}", camera.intrinsics.to_array());
     }
     for (id, ray) in scene.token_ids.iter().zip(scene.token_rays()).take(3) {
-        println!("token of patch {id}: ray from {:.3?} along {:.3?}", ray.origin, ray.direction);
+        println!("token of patch {id}: ray from {:.3?} along {:.3?}", ray.origin.to_array(), ray.direction.to_array());
     }
     Ok(())
 }

@@ -36,7 +36,7 @@ pub enum ModelError {
         /// Its index in the array.
         position: usize,
     },
-    /// Image whose sides are no multiples of the patch size.
+    /// Image whose sides are not multiples of the patch size.
     #[error("an image of {width} x {height} does not divide into patches of {patch_size} x {patch_size}")]
     NotDivisible {
         /// Width in pixels.

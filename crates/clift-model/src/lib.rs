@@ -5,6 +5,7 @@
 //! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Clift`] holds them.
 //!
 //! ```
+//! use clift_core::{Camera, ClipViews, Intrinsics, Pose};
 //! use clift_model::{Cameras, Clift, DeviceName, KMeans, ModelConfig, Views};
 //!
 //! let device = DeviceName::Flex.open()?;
@@ -12,16 +13,16 @@
 //! let model = Clift::new(&config, 0, &device);
 //!
 //! // One scene of two gray views of 16 x 16 pixels, both at the origin.
-//! let shape = [1, 2, 16, 16];
-//! let pose = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-//! let intrinsics = [16.0, 16.0, 8.0, 8.0];
-//! let views = Views::upload(&[128; 2 * 16 * 16 * 3], &pose.repeat(2), &intrinsics.repeat(2), shape, &device)?;
+//! let (width, height) = (16, 16);
+//! let camera = Camera { c2w: Pose::IDENTITY, intrinsics: Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 } };
+//! let (images, cameras) = (vec![128; 2 * height * width * 3], vec![camera; 2]);
+//! let views = Views::upload(&[&ClipViews { width, height, images, cameras, frame_index: vec![0, 1] }], &device)?;
 //!
 //! // All 8 tokens of the scene, condensed into 4 and rendered from the second camera's pose.
 //! let tokens = model.encode(&views);
 //! let clusters = KMeans::default().fit(tokens.values.clone(), 4, &[0])?.clusters.upload(&device);
 //! let tokens = model.compress(tokens, &clusters);
-//! let target = Cameras::upload(&pose, &intrinsics, [1, 1, 16, 16], &device)?;
+//! let target = Cameras::of_views(&[camera], height, width, &device)?;
 //! let image = model.render(tokens, &target);
 //! assert_eq!(image.dims(), [1, 1, 16, 16, 3]);
 //! # Ok::<(), clift_model::ModelError>(())
@@ -34,7 +35,6 @@
     )
 )]
 
-mod atomic_files;
 mod codec;
 mod cost;
 mod device;
@@ -58,7 +58,6 @@ pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tenso
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras
-pub use views::camera::ViewCamera;
 pub use views::patch::{patchify, unpatchify};
 pub use views::patch_grids::PatchGrids;
 pub use views::rays::plucker;
@@ -118,7 +117,7 @@ pub use codec::transform::{Moments, Transform};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
+pub use scene::scene::{Scene, scene_file_bytes};
 pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
 pub use scene::token_coding::{CodedLoss, TokenCoding};
 pub use scene::token_format::TokenFormat;

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::BadConfig;
+use clift_core::BadConfig;
 
 /// An error of this crate. Messages have the problem, the value found, the remedy, and the path last.
 #[derive(Debug, thiserror::Error)]
@@ -48,14 +48,14 @@ pub enum TrainError {
     /// The cluster cache was built with another encoder or other settings.
     #[error("stale cluster cache: {reason}; remove the cache to build a new one: {path}", path = path.display())]
     StaleClusters {
-        /// What differs.
+        /// The difference.
         reason: String,
         /// Folder of the cache.
         path: PathBuf,
     },
-    /// Stage 2 was trained on another encoder than that of stage 1.
+    /// Stage 2 was trained on another encoder than stage 1.
     #[error(
-        "stage 2 was trained on another encoder than that of stage 1; remove stage2/ and clusters/ and train stage 2 again: \
+        "stage 2 was trained on another encoder than stage 1; remove stage2/ and clusters/ and train stage 2 again: \
          {path}",
         path = path.display()
     )]
@@ -168,7 +168,7 @@ pub enum TrainError {
          a file system that they share"
     )]
     RanksDiffer {
-        /// What differs.
+        /// The difference.
         what: &'static str,
         /// The first rank that differs.
         rank: usize,

@@ -4,7 +4,8 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, derive_seed};
+use clift_core::derive_seed;
+use clift_data::ClipReader;
 use clift_eval::{
     CodecOptions, EvalConfig, EvalError, EvalFrames, EvalSplit, FittedCodec, evaluation_items, fit_codec,
 };

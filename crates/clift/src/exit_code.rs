@@ -1,6 +1,7 @@
 //! Error messages and exit codes.
 
-use clift_data::{BadConfig, DataError};
+use clift_core::BadConfig;
+use clift_data::DataError;
 use clift_eval::EvalError;
 use clift_train::{ConfigError, TrainError};
 use clift_view::ViewError;

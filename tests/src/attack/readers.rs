@@ -5,9 +5,10 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
+use clift_core::RgbImage;
 use clift_data::{
-    ChunkSource, DatasetRoot, EvaluationIndex, Pickle, RgbImage, SceneFilters, SceneSource, SourceOptions, Split,
-    TestScenes, decode_image, encode_jpeg, encode_png, open_source,
+    ChunkSource, DatasetRoot, EvaluationIndex, Pickle, SceneFilters, SceneSource, SourceOptions, Split, TestScenes,
+    decode_image, encode_jpeg, encode_png, open_source,
 };
 use clift_model::{Clift, CliftVariant, Scene, TokenCodec, load_part};
 use clift_train::{

@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
-use clift_eval::{Canvas, psnr, ssim, view_cameras};
+use clift_eval::{Canvas, psnr, ssim};
 use clift_model::{
     Precision, Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer,
 };
@@ -62,8 +62,8 @@ fn open(place: &Place, name: &str, preset: SelectionPreset) -> SceneRenderer {
 
 /// Renders a clip's targets, each view from `num_render_tokens` tokens.
 fn drawn(mut scene: SceneRenderer, clip: &Clip, num_render_tokens: usize) -> Vec<Vec<f32>> {
-    let views = view_cameras(&clip.target);
-    let frames = scene.render(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
+    let frames =
+        scene.render(&clip.target.cameras, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
     frames.into_iter().map(|frame| frame.pixels).collect()
 }
 
@@ -270,7 +270,7 @@ fn scene_files_overwrite_only_scene_files() {
     let encode = |words: &str| place.clift(&format!("{ENCODE} DIR/{words}"));
     let weights = place.bytes("run/stage1/model.safetensors");
     encode("run/stage1/model.safetensors")
-        .fails_with(2, &["the existing file is no scene, and only scenes are overwritten"]);
+        .fails_with(2, &["the existing file is not a scene, and only scenes are overwritten"]);
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
     encode("no/room.clift").fails_with(2, &["no folder "]);
     encode("room.clift").ok();

@@ -54,7 +54,7 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> PathBuf {
 }
 
 /// The mini data set with the camera centres of one training scene changed.
-fn moved_cameras(place: &Place, change: impl Fn(&mut clift_data::DVec3)) -> PathBuf {
+fn moved_cameras(place: &Place, change: impl Fn(&mut clift_core::DVec3)) -> PathBuf {
     changed_scene(place, |scene| scene.cameras.iter_mut().for_each(|camera| change(&mut camera.c2w.translation)))
 }
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use clift_data::{median, p95};
+use clift_core::{median, p95};
 
 use crate::support::{Place, WHOLE};
 use crate::viewer::tab::{Picture, Tab, Viewer};

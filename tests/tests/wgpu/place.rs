@@ -3,10 +3,11 @@
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose};
-use clift_eval::{upload_cameras, upload_views};
+use clift_core::{Camera, ClipViews, DMat3, DVec3, Intrinsics, Pose};
+use clift_data::Clip;
 use clift_model::{
     Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, ModelConfig, Renderer, SceneClusters,
+    Views,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -96,8 +97,7 @@ impl Place {
                 width,
                 height,
                 images,
-                c2w: c2w.into(),
-                intrinsics: vec![intrinsics; VIEWS],
+                cameras: c2w.map(|c2w| Camera { c2w, intrinsics }).into(),
                 frame_index: vec![0, 1],
             }
         };
@@ -108,14 +108,14 @@ impl Place {
         (0..BATCH).map(|scene| self.clip(scene)).collect()
     }
 
-    pub fn context(&self) -> clift_model::Views {
+    pub fn context(&self) -> Views {
         let clips = self.clips();
-        upload_views(&clips.iter().map(|clip| &clip.context).collect::<Vec<_>>(), &self.device).expect("equal sizes")
+        Views::upload(&clips.iter().map(|clip| &clip.context).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
 
     pub fn targets(&self) -> Cameras {
         let clips = self.clips();
-        upload_cameras(&clips.iter().map(|clip| &clip.target).collect::<Vec<_>>(), &self.device).expect("equal sizes")
+        Cameras::upload(&clips.iter().map(|clip| &clip.target).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
 
     /// Runs `f` forward on inputs and backward from a fixed gradient of the result.

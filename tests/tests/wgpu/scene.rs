@@ -3,11 +3,12 @@
 use std::path::Path;
 
 use burn::module::Module;
+use clift_core::{Camera, Pose};
 use clift_data::{ClipReader, DataConfig, Split, SyntheticConfig, ViewSampler, open_dataset};
 use clift_eval::{EncodeOptions, encode};
 use clift_model::{
-    CliftVariant, Scene, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel, ViewCamera,
-    load_renderer, save_weights,
+    CliftVariant, Scene, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel, load_renderer,
+    save_weights,
 };
 use clift_train::Config;
 
@@ -83,9 +84,8 @@ fn draw(place: &Place, storage: TokenFormat) -> Values {
         SceneRenderer::new(&scene, renderer, SelectionPreset::Scaled.rules(), &place.plain()).expect("finite rays");
     let between = |share: f64| {
         let [a, b] = [scene.context[0], scene.context[1]];
-        let c2w =
-            std::array::from_fn(|i| if i % 4 == 3 { (1.0 - share) * a.c2w[i] + share * b.c2w[i] } else { a.c2w[i] });
-        ViewCamera { c2w, ..a }
+        let translation = (1.0 - share) * a.c2w.translation + share * b.c2w.translation;
+        Camera { c2w: Pose { translation, ..a.c2w }, ..a }
     };
     let path = [0.0, 0.3, 0.8].map(between);
     let mut values = Values::default();

@@ -1,7 +1,6 @@
 //! Whole updates by the code of training: loss, gradient, AdamW.
 
-use clift_eval::upload_images;
-use clift_model::{Clift, Clusters, RenderTokens};
+use clift_model::{Clift, Clusters, RenderTokens, upload_images};
 use clift_train::{BatchTokens, Loss, OptimizerConfig, Stage, StageBatch, TrainState, freeze};
 
 use crate::modules::subsets;

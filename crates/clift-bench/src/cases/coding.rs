@@ -1,7 +1,8 @@
 //! The rows of the token coder, which runs on the host.
 
 use burn::tensor::Device;
-use clift_data::{DataConfig, step_rng};
+use clift_core::step_rng;
+use clift_data::DataConfig;
 use clift_model::{Histograms, NeighbourProducts, Places, RateTable, TokenCodec, TokenKind, Transform};
 use clift_train::TrainError;
 use rand::RngExt;

@@ -6,9 +6,9 @@ use std::time::Instant;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::{BadConfig, Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
-use clift_eval::upload_views;
-use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens};
+use clift_core::BadConfig;
+use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
+use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens, Views};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
@@ -21,7 +21,7 @@ pub const MAX_CHECKED_TOKENS: usize = 1024;
 /// Cases to time and their sizes.
 #[derive(Clone, Debug)]
 pub struct BenchOptions {
-    /// The cases, in any order; they run in that of [`BenchCase::ALL`].
+    /// The cases, in any order; they run in the order of [`BenchCase::ALL`].
     pub cases: Vec<BenchCase>,
     /// Timed repetitions, at least 1.
     pub repeats: usize,
@@ -48,7 +48,7 @@ impl BenchOptions {
 /// Sizes, device and inputs shared by all rows.
 pub struct BenchContext {
     pub config: Config,
-    /// Where tensors live, without autodiff.
+    /// Device of the tensors, without autodiff.
     pub device: Device,
     /// Whether tensors are in the memory of this process.
     pub is_cpu: bool,
@@ -176,7 +176,7 @@ impl BenchContext {
         if let Some(lift) = self.lift.get() {
             return Ok(lift.clone());
         }
-        let views = upload_views(&[&self.clip(1).context], &self.device)?;
+        let views = Views::upload(&[&self.clip(1).context], &self.device)?;
         let lift = self.model().valid().encode(&views);
         Ok(self.lift.get_or_init(|| lift).clone())
     }

@@ -3,8 +3,7 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use clift_data::{step_rng, uniform_below};
-use clift_eval::{upload_cameras, upload_views};
+use clift_core::{step_rng, uniform_below};
 use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer, Tokens, Views, cluster_attention};
 use clift_train::{TrainError, seeded_clusters, seeded_uniform};
 
@@ -51,7 +50,7 @@ impl<I: ToF64> BenchTask for Forward<I> {
 
 /// Encoder: context views to tokens.
 pub fn encode(context: &BenchContext) -> Result<Forward<(Network<Encoder>, Views)>, TrainError> {
-    let views = upload_views(&[&context.clip(1).context], &context.device)?;
+    let views = Views::upload(&[&context.clip(1).context], &context.device)?;
     let encoder = Network(context.model().encoder.valid());
     Ok(Forward::new((encoder, views), |(encoder, views)| encoder.0.forward(views).values.flatten(0, 2)))
 }
@@ -111,7 +110,7 @@ pub fn render(
 ) -> Result<Forward<(Network<Renderer>, Tokens, Cameras)>, TrainError> {
     let ids: Vec<u32> = (0..context.num_render_tokens()? as u32).collect();
     let lift = context.lift()?.select(&ids);
-    let targets = upload_cameras(&[&context.clip(num_views).target], &context.device)?;
+    let targets = Cameras::upload(&[&context.clip(num_views).target], &context.device)?;
     let renderer = Network(context.model().renderer.valid());
     let render = Forward::new((renderer, lift, targets), |(renderer, lift, targets)| {
         renderer.0.forward(lift.clone(), targets).flatten(0, 4)

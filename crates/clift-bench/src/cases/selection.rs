@@ -1,9 +1,8 @@
 //! The row of token selection, which runs on the host.
 
 use burn::tensor::Device;
-use clift_data::{DVec3, step_rng};
-use clift_eval::view_cameras;
-use clift_model::{SelectionPreset, Selector, TokenRay, ViewCamera};
+use clift_core::{Camera, DVec3, step_rng};
+use clift_model::{SelectionPreset, Selector, TokenRay};
 use clift_train::TrainError;
 use rand::RngExt;
 
@@ -13,7 +12,7 @@ use crate::cases::task::BenchTask;
 /// Algorithm 1 of the paper: half of a scene's stored tokens for one view.
 pub struct SelectionCase {
     selector: Selector,
-    camera: ViewCamera,
+    camera: Camera,
     size: [usize; 2],
     num_render_tokens: usize,
 }
@@ -26,15 +25,15 @@ impl SelectionCase {
         // A random pixel of every context view in turn.
         let rays: Vec<TokenRay> = (0..count)
             .map(|token| {
-                let pose = clip.context.c2w[token % clip.context.num_views()];
+                let pose = clip.context.cameras[token % clip.context.num_views()].c2w;
                 let [x, y] = [0, 1].map(|_| rng.random_range(-0.5..0.5));
                 let direction = pose.rotation * DVec3::new(x, y, 1.0);
-                TokenRay { origin: pose.translation.into(), direction: direction.into() }
+                TokenRay { origin: pose.translation, direction }
             })
             .collect();
         Ok(Self {
             selector: Selector::new(SelectionPreset::Paper.rules(), &rays)?,
-            camera: view_cameras(&clip.target).swap_remove(0),
+            camera: clip.target.cameras[0],
             size: context.shape().size,
             num_render_tokens: count.div_ceil(2),
         })

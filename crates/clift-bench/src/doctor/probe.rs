@@ -6,8 +6,7 @@ use std::time::Instant;
 
 use burn::module::Module;
 use burn::tensor::{DType, Device};
-use clift_eval::upload_views;
-use clift_model::{DeviceName, KMeans, ModelConfig, Precision};
+use clift_model::{DeviceName, KMeans, ModelConfig, Precision, Views};
 use clift_train::{ClipShape, TrainError, seeded_batch, seeded_model};
 
 use crate::cases::reference::largest_magnitude;
@@ -99,7 +98,7 @@ fn gradient(device: &Device) -> Result<Gradient, TrainError> {
     let model = seeded_model(&config, 0, device);
     let batch = seeded_batch(shape, 1, num_tokens, Some(num_tokens / 4), 0)?;
     // The clusters of the batch are random: those of K-means may depend on the last bit of a distance.
-    let views = upload_views(&[&batch.clips[0].context], device)?;
+    let views = Views::upload(&[&batch.clips[0].context], device)?;
     KMeans::default().fit(model.valid().encode(&views).values, num_tokens / 4, &[0])?;
     let (loss, values) = loss_and_gradient(&model, &batch, device)?;
     Ok(Gradient { loss, values })

@@ -7,7 +7,7 @@ use crate::error::DataError;
 
 const MAX_ENTRIES: usize = 1_000_000;
 
-/// Returns the names of the entries of a folder, sorted, without names that are no UTF-8.
+/// Returns the names of the entries of a folder, sorted, without names that are not UTF-8.
 pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(DataError::io("listing the folder", folder))? {

@@ -1,8 +1,7 @@
 //! Lens distortion in the models of OpenCV and COLMAP.
 
+use clift_core::CameraError;
 use glam::{DMat2, DVec2};
-
-use crate::error::DataError;
 
 /// Largest number of Newton steps; real lenses need three to five.
 const MAX_STEPS: usize = 50;
@@ -29,13 +28,13 @@ impl Lens {
     /// Checks that every coefficient is finite.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] with the first coefficient that is not finite.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// [`CameraError::BadCamera`] with the first coefficient that is not finite.
+    pub fn validate(&self) -> Result<(), CameraError> {
         let [k1, k2, k3] = self.radial;
         let [p1, p2] = self.tangential;
         for (name, value) in [("k1", k1), ("k2", k2), ("k3", k3), ("p1", p1), ("p2", p2)] {
             if !value.is_finite() {
-                return Err(DataError::BadCamera { what: format!("{name} is {value}, expected a finite number") });
+                return Err(CameraError::BadCamera { what: format!("{name} is {value}, expected a finite number") });
             }
         }
         Ok(())

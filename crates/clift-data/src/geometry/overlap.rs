@@ -1,9 +1,7 @@
 //! View overlap of two cameras, from poses and intrinsics alone.
 
+use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::DVec3;
-
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
 
 /// Rays along each side of the image.
 const SIDE: usize = 32;
@@ -12,12 +10,12 @@ const SIDE: usize = 32;
 /// front of `from` that projects into the image of `to`.
 ///
 /// pixelSplat's measure. It needs no depth and is an upper bound of the true overlap.
-pub fn overlap(from: &Camera, to: &Camera) -> f64 {
+pub fn overlap(from: &Camera<IntrinsicsNorm>, to: &Camera<IntrinsicsNorm>) -> f64 {
     let motion = to.c2w.inverse().after(from.c2w);
     let coordinate = |index: usize| (index as f64 + 0.5) / SIDE as f64;
     let rays = (0..SIDE * SIDE).map(|ray| [coordinate(ray % SIDE), coordinate(ray / SIDE)]);
     let seen = rays.filter(|[u, v]| {
-        let k = from.intrinsics_norm;
+        let k = from.intrinsics;
         is_seen(motion, DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0), to)
     });
     seen.count() as f64 / (SIDE * SIDE) as f64
@@ -25,8 +23,8 @@ pub fn overlap(from: &Camera, to: &Camera) -> f64 {
 
 /// Returns whether any point at `t > 0` of the ray from the origin, moved by `motion`, lies in the view of `to`. The
 /// view is bounded by four planes through the camera centre, each a linear condition on `t`.
-fn is_seen(motion: Pose, direction: DVec3, to: &Camera) -> bool {
-    let k = to.intrinsics_norm;
+fn is_seen(motion: Pose, direction: DVec3, to: &Camera<IntrinsicsNorm>) -> bool {
+    let k = to.intrinsics;
     let inside = |DVec3 { x, y, z }: DVec3| {
         [k.fx * x + k.cx * z, (1.0 - k.cx) * z - k.fx * x, k.fy * y + k.cy * z, (1.0 - k.cy) * z - k.fy * y]
     };
@@ -47,14 +45,13 @@ fn is_seen(motion: Pose, direction: DVec3, to: &Camera) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
-    use crate::random::{step_rng, uniform_01};
+    use clift_core::{step_rng, uniform_01};
     use glam::DMat3;
 
-    fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera {
+    fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera<IntrinsicsNorm> {
         let rotation = DMat3::from_rotation_y(turn_deg.to_radians());
         let intrinsics_norm = IntrinsicsNorm { fx: 0.5, fy: 0.5, cx: 0.5, cy: 0.5 }; // 90 degrees
-        Camera { intrinsics_norm, c2w: Pose { rotation, translation: centre.into() } }
+        Camera { intrinsics: intrinsics_norm, c2w: Pose { rotation, translation: centre.into() } }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Context views spread over a camera path.
 
-use crate::geometry::pose::Pose;
+use clift_core::Pose;
 
 /// Selects `num_views` frames from the first to the last at even distances along the path of the camera centres.
 ///

@@ -3,16 +3,13 @@
 use std::ops::RangeInclusive;
 use std::path::Path;
 
+use clift_core::{Camera, Intrinsics, IntrinsicsNorm, Pose, PoseNormalization, check_near};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use crate::error::DataError;
 use crate::files::bounded::parse_json;
 use crate::files::listing::natural_order;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
-use crate::geometry::camera_path::PathView;
-use crate::geometry::normalization::{PoseNormalization, check_near};
-use crate::geometry::pose::Pose;
 
 const MAX_POSES: usize = 100_000;
 /// Accepted focal lengths over width and height; the upper bound also limits the principal point's distance from 0.
@@ -72,7 +69,7 @@ pub fn read_poses(
     default: Intrinsics,
     width: usize,
     height: usize,
-) -> Result<Vec<PathView>, DataError> {
+) -> Result<Vec<Camera>, DataError> {
     let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
     let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
     let wrong_form = |error: serde_json::Error| {
@@ -119,7 +116,7 @@ pub fn read_poses(
                 )));
             }
         };
-        Ok(PathView { c2w, intrinsics })
+        Ok(Camera { c2w, intrinsics })
     };
     poses.into_iter().enumerate().map(view).collect()
 }
@@ -138,12 +135,12 @@ mod tests {
         Pose { rotation: DMat3::IDENTITY, translation: centre.into() }
     }
 
-    fn assert_close(a: &PathView, b: [f64; 3]) {
+    fn assert_close(a: &Camera, b: [f64; 3]) {
         let (a, b) = (a.c2w.to_matrix_f64(), pose(b).to_matrix_f64());
         assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-12), "{a:?} {b:?}");
     }
 
-    fn read(json: &str) -> Result<Vec<PathView>, DataError> {
+    fn read(json: &str) -> Result<Vec<Camera>, DataError> {
         let frame = PoseNormalization { mean_c2w: pose([1.0, 0.0, 0.0]), scale: 2.0 };
         read_from_file("poses.json", json, |path| read_poses(path, &frame, K, 64, 32))
     }

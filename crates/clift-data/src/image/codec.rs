@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
+use clift_core::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::metadata::Orientation;
@@ -11,7 +12,6 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFo
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::image::rgb_image::RgbImage;
 
 /// Largest number of columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;
@@ -249,7 +249,7 @@ mod tests {
             assert_eq!(check_encoded(bytes).unwrap_err(), expected);
         }
         assert!(check_encoded(b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9").is_err(), "no size");
-        // What cannot be decoded is no frame.
+        // Bytes that cannot be decoded are not a frame.
         let folder = tempfile::tempdir().unwrap();
         for (width, is_ok) in [(MAX_SIDE as usize, true), (MAX_SIDE as usize + 1, false)] {
             let wide = encode_png(&ramp(width, 1)).unwrap();

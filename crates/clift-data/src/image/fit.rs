@@ -1,11 +1,10 @@
 //! Images and intrinsics rescaled and cropped to the model's size.
 
+use clift_core::{Intrinsics, IntrinsicsNorm, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::image::lanczos::{Window, resize_lanczos_window};
-use crate::image::rgb_image::RgbImage;
 
 /// Position of the principal point in a cropped image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -7,7 +7,7 @@
 use std::f64::consts::PI;
 use std::ops::Range;
 
-use crate::image::rgb_image::RgbImage;
+use clift_core::RgbImage;
 
 /// Fraction bits of a weight: 32 minus 8 for the pixel and 2 for the overshoot of a sum.
 const PRECISION_BITS: u32 = 32 - 8 - 2;

@@ -1,11 +1,10 @@
 //! Resampling of lens-distorted images to pinhole images.
 
+use clift_core::{IntrinsicsNorm, RgbImage};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::IntrinsicsNorm;
 use crate::geometry::lens::Lens;
-use crate::image::rgb_image::RgbImage;
 
 /// Points of each image edge at which the lens is inverted.
 const EDGE_POINTS: usize = 129;
@@ -25,12 +24,12 @@ impl Undistortion {
     /// Computes the pinhole camera for images taken with `intrinsics_norm` through `lens`.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for a lens that cannot be inverted at the image edge, and for a principal point outside
+    /// [`DataError::Camera`] for a lens that cannot be inverted at the image edge, and for a principal point outside
     /// the image.
     pub fn new(intrinsics_norm: IntrinsicsNorm, lens: Lens) -> Result<Self, DataError> {
         lens.validate()?;
         let IntrinsicsNorm { fx, fy, cx, cy } = intrinsics_norm;
-        let bad = |what: String| DataError::BadCamera { what };
+        let bad = DataError::bad_camera;
         // The ray of each edge that is nearest to the axis bounds the rectangle without blank pixels.
         let [mut left, mut right, mut top, mut bottom] = [f64::INFINITY; 4];
         for step in 0..EDGE_POINTS {

@@ -3,12 +3,13 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use clift_core::{
+    Camera, ClipViews, Intrinsics, IntrinsicsNorm, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near,
+};
+
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, Intrinsics};
-use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale, check_near};
 use crate::image::fit::fit_image;
-use crate::image::rgb_image::RgbImage;
-use crate::sampling::clip::{Clip, ClipViews, ViewIndices};
+use crate::sampling::clip::{Clip, ViewIndices};
 use crate::scene_source::SceneSource;
 
 /// Options for the preparation of frames and poses.
@@ -41,8 +42,8 @@ impl ClipReader {
     ///
     /// # Errors
     /// [`DataError::NoSuchFrame`] for a position beyond the scene, [`DataError::InFrame`] around
-    /// [`DataError::BadCamera`] for a camera too far from the contexts, and the errors of reading cameras and frames, of
-    /// fitting ([`DataError::Upscale`]) and of normalising ([`DataError::ZeroBaseline`]).
+    /// [`DataError::Camera`] for a camera too far from the contexts, and the errors of reading cameras and frames, of
+    /// fitting ([`DataError::Upscale`]) and of normalising ([`DataError::Camera`]).
     pub fn read(&self, scene: usize, views: &ViewIndices) -> Result<Clip, DataError> {
         let key = self.source.key(scene);
         let cameras = self.source.cameras(scene)?;
@@ -63,23 +64,31 @@ impl ClipReader {
         let mut fitted = HashMap::new();
         for &frame in frames {
             if let std::collections::hash_map::Entry::Vacant(entry) = fitted.entry(frame) {
-                entry.insert(self.fitted(scene, frame, &cameras[frame])?);
+                entry.insert(self.fitted(scene, frame, cameras[frame].intrinsics)?);
             }
         }
+        let camera = |frame: &usize| {
+            let c2w = normalization.normalize(cameras[*frame].c2w);
+            Camera { c2w, intrinsics: fitted[frame].1 }
+        };
         let gather = |frames: &[usize]| ClipViews {
             width: self.options.width,
             height: self.options.height,
             images: frames.iter().flat_map(|frame| &fitted[frame].0.rgb).copied().collect(),
-            c2w: frames.iter().map(|frame| normalization.normalize(cameras[*frame].c2w)).collect(),
-            intrinsics: frames.iter().map(|frame| fitted[frame].1).collect(),
+            cameras: frames.iter().map(camera).collect(),
             frame_index: frames.to_vec(),
         };
         Ok(Clip { key: key.to_owned(), context: gather(&views.context), target: gather(&views.target) })
     }
 
-    fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(RgbImage, Intrinsics), DataError> {
+    fn fitted(
+        &self,
+        scene: usize,
+        frame: usize,
+        intrinsics: IntrinsicsNorm,
+    ) -> Result<(RgbImage, Intrinsics), DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
-        fit_image(&self.source.frame(scene, frame)?, camera.intrinsics_norm, width, height, exact_principal_point)
+        fit_image(&self.source.frame(scene, frame)?, intrinsics, width, height, exact_principal_point)
             .map_err(DataError::in_frame(self.source.key(scene), frame))
     }
 }
@@ -87,9 +96,9 @@ impl ClipReader {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::Pose;
     use crate::scene_source::Split;
     use crate::testing::{TestSource, re10k_mini};
+    use clift_core::Pose;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     const OPTIONS: ClipOptions = ClipOptions {
@@ -132,9 +141,9 @@ mod tests {
         assert_eq!(clip.context.images[2 * bytes..], clip.target.images[..bytes]);
         assert_eq!(clip.target.images[..bytes], clip.target.images[bytes..2 * bytes]);
         assert_ne!(clip.target.images[bytes..2 * bytes], clip.target.images[2 * bytes..]);
-        assert_eq!(clip.context.c2w[2], clip.target.c2w[0]);
+        assert_eq!(clip.context.cameras[2].c2w, clip.target.cameras[0].c2w);
         // 64x36 to 57x32, cropped to 32: fx = 0.9 * 57, fy = 1.6 * 32, as f32 files hold them.
-        let intrinsics = clip.target.intrinsics[0];
+        let intrinsics = clip.target.cameras[0].intrinsics;
         assert!((intrinsics.fx - 51.3).abs() < 1e-5 && (intrinsics.fy - 51.2).abs() < 1e-5, "{intrinsics:?}");
         assert_eq!((intrinsics.cx, intrinsics.cy), (16.0, 16.0));
     }
@@ -143,10 +152,10 @@ mod tests {
     fn contexts_reach_to_one_and_targets_lie_between() {
         let (reader, _) = reader(None, OPTIONS);
         let clip = reader.read(0, &views(&[0, 7], &[3])).unwrap();
-        let [first, last] = [0, 1].map(|view| clip.context.c2w[view].translation);
+        let [first, last] = [0, 1].map(|view| clip.context.cameras[view].c2w.translation);
         assert!((first + last).abs().max_element() < 1e-6, "{first} {last}"); // f32 files
         assert!((first[0].abs() - 1.0).abs() < 1e-12, "{first:?}"); // the camera slides along x
-        let between = clip.target.c2w[0].translation;
+        let between = clip.target.cameras[0].c2w.translation;
         // Centres are 0.1 * frame along a line: frame 3 of 0..7 is at -1 + 2 * 3 / 7.
         assert!((between[0] - (6.0 / 7.0 - 1.0)).abs() < 1e-5, "{between:?}");
     }

@@ -173,7 +173,7 @@ pub fn even_views_of(
     let context: Vec<usize> = (0..num_context).map(|view| frames[spread(view, num_context, frames.len())]).collect();
     let rest = targets.unwrap_or(frames).iter().copied().filter(|frame| !context.contains(frame));
     let rest: Vec<usize> = rest.collect();
-    // With two frames to spare, the outermost ones, next to a context, are no targets.
+    // With two frames to spare, the outermost ones, next to a context, are not targets.
     let has_spare = rest.len() >= num_targets + 2;
     let position = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
     let target = (0..num_targets).map(|target| rest[position(target)]).collect();
@@ -258,7 +258,7 @@ mod tests {
 
     #[test]
     fn unusable_entries_are_skipped_up_to_the_limit() {
-        let broken = || DataError::BadCamera { what: "the pose holds NaN".into() };
+        let broken = || DataError::bad_camera("the pose holds NaN".into());
         let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (5, 8)))
             .with_cameras(move |scene, cameras| if scene == 1 { Err(broken()) } else { Ok(cameras) });
         let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8

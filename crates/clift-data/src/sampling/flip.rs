@@ -1,10 +1,9 @@
 //! Mirrored clips: left and right exchanged in images and cameras.
 
+use clift_core::{Camera, ClipViews, Intrinsics, Pose};
 use glam::{DMat3, DVec3};
 
-use crate::geometry::camera::Intrinsics;
-use crate::geometry::pose::Pose;
-use crate::sampling::clip::{Clip, ClipViews};
+use crate::sampling::clip::Clip;
 
 impl Clip {
     /// Returns the mirrored clip: image columns are reversed, poses become `S c2w S` with `S = diag(-1, 1, 1)`, and
@@ -16,23 +15,19 @@ impl Clip {
     // column. Its intrinsics stay, which is correct only for a principal point at the centre.
     #[must_use]
     pub fn flipped(&self) -> Self {
-        Self { key: self.key.clone(), context: self.context.flipped(), target: self.target.flipped() }
+        Self { key: self.key.clone(), context: flipped(&self.context), target: flipped(&self.target) }
     }
 }
 
-impl ClipViews {
-    fn flipped(&self) -> Self {
-        let rows = self.images.chunks_exact((self.width * 3).max(1));
-        let images = rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect();
-        let mirrored = |k: &Intrinsics| Intrinsics { cx: self.width as f64 - k.cx, ..*k };
-        Self {
-            images,
-            c2w: self.c2w.iter().map(|pose| mirrored_pose(*pose)).collect(),
-            intrinsics: self.intrinsics.iter().map(mirrored).collect(),
-            frame_index: self.frame_index.clone(),
-            ..*self
-        }
-    }
+fn flipped(views: &ClipViews) -> ClipViews {
+    let rows = views.images.chunks_exact((views.width * 3).max(1));
+    let images = rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect();
+    let mirrored = |camera: &Camera| Camera {
+        c2w: mirrored_pose(camera.c2w),
+        intrinsics: Intrinsics { cx: views.width as f64 - camera.intrinsics.cx, ..camera.intrinsics },
+    };
+    let cameras = views.cameras.iter().map(mirrored).collect();
+    ClipViews { images, cameras, frame_index: views.frame_index.clone(), ..*views }
 }
 
 /// Returns `S pose S` with `S = diag(-1, 1, 1)`.
@@ -45,20 +40,19 @@ fn mirrored_pose(Pose { rotation, translation }: Pose) -> Pose {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::normalization::{PoseRotation, PoseScale};
-    use crate::image::rgb_image::RgbImage;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::clip_reader::{ClipOptions, ClipReader};
     use crate::scene_source::SceneSource;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{TestSource, rooms};
+    use clift_core::{PoseRotation, PoseScale, RgbImage};
     use std::sync::Arc;
 
     fn mirrored(source: SyntheticSource) -> TestSource {
         let mirrored = TestSource::new(source).with_cameras(|_, mut cameras| {
             for camera in &mut cameras {
                 camera.c2w = mirrored_pose(camera.c2w);
-                camera.intrinsics_norm.cx = 1.0 - camera.intrinsics_norm.cx;
+                camera.intrinsics.cx = 1.0 - camera.intrinsics.cx;
             }
             Ok(cameras)
         });
@@ -87,17 +81,17 @@ mod tests {
 
     /// Returns moment and direction of the Plücker ray through a point of a view, in pixels.
     fn ray(views: &ClipViews, view: usize, x: f64, y: f64) -> [DVec3; 2] {
-        let (pose, Intrinsics { fx, fy, cx, cy }) = (views.c2w[view], views.intrinsics[view]);
-        let direction = pose.rotation * DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0).normalize();
-        [pose.translation.cross(direction), direction]
+        let camera = &views.cameras[view];
+        let direction = camera.direction(x, y);
+        [camera.c2w.translation.cross(direction), direction]
     }
 
     #[test]
     fn rays_and_pixels_of_a_flipped_clip_are_mirrored() {
         let mut clip = read(Arc::new(room()), [40, 16], PoseRotation::Quaternion);
         for views in [&mut clip.context, &mut clip.target] {
-            for k in &mut views.intrinsics {
-                k.cx += 1.7;
+            for camera in &mut views.cameras {
+                camera.intrinsics.cx += 1.7;
             }
         }
         let flipped = clip.flipped();
@@ -135,8 +129,9 @@ mod tests {
             for (got, expected) in [(&got.context, &expected.context), (&got.target, &expected.target)] {
                 assert_eq!(got.images, expected.images);
                 let numbers = |views: &ClipViews| -> Vec<f64> {
-                    let poses = views.c2w.iter().flat_map(|pose| pose.to_matrix_f64());
-                    poses.chain(views.intrinsics.iter().flat_map(|k| [k.fx, k.fy, k.cx, k.cy])).collect()
+                    let numbers =
+                        |camera: &Camera| camera.c2w.to_matrix_f64().into_iter().chain(camera.intrinsics.to_array());
+                    views.cameras.iter().flat_map(numbers).collect()
                 };
                 for (got, expected) in numbers(got).iter().zip(numbers(expected)) {
                     assert!((got - expected).abs() < 1e-9, "{got} against {expected}");

@@ -1,7 +1,8 @@
 //! Clips with half the columns and rows.
 
-use crate::geometry::camera::Intrinsics;
-use crate::sampling::clip::{Clip, ClipViews};
+use clift_core::{Camera, ClipViews, Intrinsics};
+
+use crate::sampling::clip::Clip;
 
 impl Clip {
     /// Returns the clip with half as many columns and rows: a pixel is the mean of two by two. Of an odd number of columns or
@@ -9,34 +10,35 @@ impl Clip {
     #[must_use]
     pub fn at_half_resolution(&self) -> Self {
         let Self { key, context, target } = self;
-        Self { key: key.clone(), context: context.at_half_resolution(), target: target.at_half_resolution() }
+        Self { key: key.clone(), context: at_half_resolution(context), target: at_half_resolution(target) }
     }
 }
 
-impl ClipViews {
-    fn at_half_resolution(&self) -> Self {
-        let (width, height) = (self.width / 2, self.height / 2);
-        let row_bytes = 3 * self.width;
-        let mut images = Vec::with_capacity(3 * width * height * self.num_views());
-        for image in self.images.chunks_exact((row_bytes * self.height).max(1)) {
-            for rows in image.chunks_exact(2 * row_bytes) {
-                let (upper, lower) = rows.split_at(row_bytes);
-                for at in (0..width).flat_map(|column| (0..3).map(move |channel| 6 * column + channel)) {
-                    let sum: u16 = [upper[at], upper[at + 3], lower[at], lower[at + 3]].map(u16::from).iter().sum();
-                    images.push(((sum + 2) / 4) as u8);
-                }
+fn at_half_resolution(views: &ClipViews) -> ClipViews {
+    let (width, height) = (views.width / 2, views.height / 2);
+    let row_bytes = 3 * views.width;
+    let mut images = Vec::with_capacity(3 * width * height * views.num_views());
+    for image in views.images.chunks_exact((row_bytes * views.height).max(1)) {
+        for rows in image.chunks_exact(2 * row_bytes) {
+            let (upper, lower) = rows.split_at(row_bytes);
+            for at in (0..width).flat_map(|column| (0..3).map(move |channel| 6 * column + channel)) {
+                let sum: u16 = [upper[at], upper[at + 3], lower[at], lower[at + 3]].map(u16::from).iter().sum();
+                images.push(((sum + 2) / 4) as u8);
             }
         }
-        let halved = |k: &Intrinsics| Intrinsics { fx: k.fx / 2.0, fy: k.fy / 2.0, cx: k.cx / 2.0, cy: k.cy / 2.0 };
-        let (c2w, frame_index) = (self.c2w.clone(), self.frame_index.clone());
-        Self { width, height, images, c2w, intrinsics: self.intrinsics.iter().map(halved).collect(), frame_index }
     }
+    let halved = |camera: &Camera| Camera {
+        intrinsics: Intrinsics::from(camera.intrinsics.to_array().map(|pixels| pixels / 2.0)),
+        ..*camera
+    };
+    let cameras = views.cameras.iter().map(halved).collect();
+    ClipViews { width, height, images, cameras, frame_index: views.frame_index.clone() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::Pose;
+    use clift_core::Pose;
 
     #[test]
     fn a_pixel_is_the_mean_of_two_by_two() {
@@ -54,8 +56,7 @@ mod tests {
             width,
             height,
             images,
-            c2w: vec![Pose::IDENTITY; 2],
-            intrinsics: vec![k; 2],
+            cameras: vec![Camera { c2w: Pose::IDENTITY, intrinsics: k }; 2],
             frame_index: vec![4, 2],
         };
         let clip = Clip { key: "room".into(), context: views.clone(), target: views };
@@ -63,8 +64,9 @@ mod tests {
         assert_eq!((key.as_str(), context.width, context.height), ("room", 2, 1));
         // The mean of 0, 4, 20 and 24 is 12.
         assert_eq!(context.images, [12, 13, 14, 20, 21, 22, 112, 113, 114, 120, 121, 122]);
-        assert_eq!(context.intrinsics, [Intrinsics { fx: 2.5, fy: 3.0, cx: 1.25, cy: 0.5 }; 2]);
-        assert_eq!((&context.frame_index[..], &context.c2w[..]), (&[4, 2][..], &[Pose::IDENTITY; 2][..]));
+        let intrinsics = Intrinsics { fx: 2.5, fy: 3.0, cx: 1.25, cy: 0.5 };
+        assert_eq!(context.cameras, [Camera { c2w: Pose::IDENTITY, intrinsics }; 2]);
+        assert_eq!(context.frame_index, [4, 2]);
         assert_eq!(target, context);
     }
 }

@@ -1,10 +1,9 @@
 //! Context views between the first and the last: random, spread in space, or spread in time.
 
+use clift_core::sample_distinct;
 use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-
-use crate::random::sample_distinct;
 
 /// Selection of the context frames between the first and the last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -71,7 +70,7 @@ fn farthest_points(left: usize, right: usize, count: usize, centres: &[DVec3]) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
+    use clift_core::step_rng;
 
     fn choose(inner: InnerViews, left: usize, right: usize, count: usize, centres: &[DVec3]) -> Vec<usize> {
         inner.choose(&mut step_rng(1, 2, "test"), left, right, count, centres)

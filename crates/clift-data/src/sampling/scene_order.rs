@@ -1,8 +1,8 @@
 //! The scene of every batch slot: a function of (seed, step, slot) alone.
 
-use crate::bad_config::check_config;
+use clift_core::{check_config, derive_seed, mix};
+
 use crate::error::DataError;
-use crate::random::{derive_seed, mix};
 
 /// Rounds of the Feistel network behind [`SceneOrder`]. Four suffice in theory; more cost nothing.
 const FEISTEL_ROUNDS: u64 = 8;

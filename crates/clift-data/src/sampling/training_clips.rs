@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use clift_core::{item_rng, uniform_01};
+
 use crate::error::DataError;
-use crate::random::{item_rng, uniform_01};
 use crate::sampling::clip::{Clip, ViewIndices};
 use crate::sampling::scene_order::SceneOrder;
 use crate::sampling::slot_filler::{NoUsableScene, SlotFiller};
@@ -37,7 +38,7 @@ impl TrainingClips {
     /// Prepares batches of `batch_size` clips of the scenes of `source`, read by `read`.
     ///
     /// `seed` determines all random values. Each stage of a run needs its own seed
-    /// ([`derive_seed`](crate::random::derive_seed)).
+    /// ([`derive_seed`](clift_core::derive_seed)).
     ///
     /// # Errors
     /// [`DataError::BadConfig`] for an invalid sampler, a source without scenes and a `batch_size` of 0.
@@ -104,20 +105,22 @@ impl TrainingClips {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::Pose;
-    use crate::sampling::clip::ClipViews;
     use crate::testing::Lengths;
+    use clift_core::{Camera, ClipViews, Intrinsics, Pose};
 
     fn clips(lengths: Vec<usize>, batch_size: usize, seed: u64) -> TrainingClips {
         let source = Arc::new(Lengths::new(lengths));
         let keys = source.keys.clone();
+        let camera = Camera {
+            c2w: Pose { translation: [1.0, 0.0, 0.0].into(), ..Pose::IDENTITY },
+            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 },
+        };
         let read = move |scene: usize, views: &ViewIndices| {
             let only = |frame_index: &[usize]| ClipViews {
                 width: 0,
                 height: 0,
                 images: Vec::new(),
-                c2w: vec![Pose { translation: [1.0, 0.0, 0.0].into(), ..Pose::IDENTITY }; frame_index.len()],
-                intrinsics: Vec::new(),
+                cameras: vec![camera; frame_index.len()],
                 frame_index: frame_index.to_vec(),
             };
             Ok(Clip { key: keys[scene].clone(), context: only(&views.context), target: only(&views.target) })
@@ -143,7 +146,7 @@ mod tests {
         for (clips, expected) in [(mixed().with_flip(true), 0xd652_d9cf), (clips(rare, 8, 12345), 0x1fc9_670d)] {
             let line = |step: u64, (clips, skipped): (Vec<Clip>, Vec<SkippedScene>)| {
                 let clips = clips.iter().map(|Clip { key, context, target }| {
-                    (key, &context.frame_index, &target.frame_index, context.c2w[0].translation[0])
+                    (key, &context.frame_index, &target.frame_index, context.cameras[0].c2w.translation[0])
                 });
                 let skips = skipped.iter().map(|skip| (&skip.key, &skip.reason));
                 format!("{step} {:?} {:?}", clips.collect::<Vec<_>>(), skips.collect::<Vec<_>>())

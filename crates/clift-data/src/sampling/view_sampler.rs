@@ -1,12 +1,11 @@
 //! Samples the context and target frames of a training item.
 
+use clift_core::{BadConfig, check_config, sample_from, step_rng, uniform_below, uniform_between};
 use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::bad_config::{BadConfig, check_config};
 use crate::error::DataError;
-use crate::random::{sample_from, step_rng, uniform_below, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;
@@ -184,7 +183,7 @@ impl ViewSampler {
     }
 }
 
-/// Samples stage-2 targets of a stored context set: frames between the first and the last context that are no contexts.
+/// Samples stage-2 targets of a stored context set: frames between the first and the last context that are not context views.
 ///
 /// Targets repeat only if there are fewer candidates than targets. Without any candidate, contexts are sampled with
 /// replacement.

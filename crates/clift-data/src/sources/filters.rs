@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::bad_config::{BadConfig, check_config};
 use crate::error::DataError;
+use clift_core::{BadConfig, check_config};
 
 /// Filters of the scenes of a data set. Skipped scenes are listed in the skip report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

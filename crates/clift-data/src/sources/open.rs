@@ -4,7 +4,6 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use crate::bad_config::BadConfig;
 use crate::error::DataError;
 use crate::files::caches::cache_folder;
 use crate::files::listing::file_names;
@@ -21,6 +20,7 @@ use crate::sources::photos::photo_source::{PhotoSource, PhotoSourceOptions};
 use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder};
 use crate::sources::subset::SceneSubset;
 use crate::sources::test_scenes::TestScenes;
+use clift_core::BadConfig;
 
 /// Image folders of DL3DV scenes, by preference: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];

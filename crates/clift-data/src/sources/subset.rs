@@ -3,9 +3,9 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
 /// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
@@ -72,7 +72,7 @@ impl SceneSource for SceneSubset {
         Ok(if self.hold_out == 0 { num_frames } else { num_frames - num_frames.div_ceil(self.hold_out) })
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         Ok(self.kept(self.source.cameras(self.scenes[scene])?))
     }
 

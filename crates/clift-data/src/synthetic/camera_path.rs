@@ -2,12 +2,10 @@
 
 use std::f64::consts::TAU;
 
+use clift_core::{Camera, IntrinsicsNorm, Pose, uniform_01};
 use glam::{DMat3, DVec3};
 use rand::Rng;
 
-use crate::geometry::camera::{Camera, IntrinsicsNorm};
-use crate::geometry::pose::Pose;
-use crate::random::uniform_01;
 use crate::synthetic::config::LookDirection;
 
 /// Smallest distance between the camera and any surface, in the scene's units of length.
@@ -69,7 +67,7 @@ impl CameraPath {
     }
 
     /// Returns an upright camera with square pixels and a horizontal field of view of `fov_deg` degrees.
-    pub fn camera(&self, time: f64, fov_deg: f64, aspect: f64) -> Camera {
+    pub fn camera(&self, time: f64, fov_deg: f64, aspect: f64) -> Camera<IntrinsicsNorm> {
         let position = self.position(time);
         let swing = (TAU * time + self.phase).cos();
         let [target, drift] = self.target;
@@ -86,7 +84,7 @@ impl CameraPath {
         let right = unit_vector(DVec3::Y.cross(forward));
         let fx = 0.5 / (0.5 * fov_deg.to_radians()).tan();
         Camera {
-            intrinsics_norm: IntrinsicsNorm { fx, fy: fx * aspect, cx: 0.5, cy: 0.5 },
+            intrinsics: IntrinsicsNorm { fx, fy: fx * aspect, cx: 0.5, cy: 0.5 },
             c2w: Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: position },
         }
     }

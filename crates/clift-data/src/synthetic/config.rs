@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::bad_config::{BadConfig, check_config};
 use crate::scene_source::Split;
+use clift_core::{BadConfig, check_config};
 
 /// Largest number of scenes of one source: the table of key blocks stays below 1 MiB.
 pub(crate) const MAX_SCENES: usize = 32_000_000;

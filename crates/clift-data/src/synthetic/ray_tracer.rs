@@ -3,10 +3,9 @@
 //! Soft shadows are computed from the distance at which the ray to the lamp passes an object, not by sampling the lamp.
 //! Images have no noise, and a frame is a pure function of room and camera.
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
 use glam::{DVec3, Vec3};
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::synthetic::room::{Object, Room, Shape, turned};
 use crate::synthetic::tracing::noise::smooth;
 use crate::synthetic::tracing::surface::Surface;
@@ -43,13 +42,13 @@ impl Hit {
 /// Renders `room` with `side * side` rays per pixel. `specular` in `[0, 1]` scales all light that depends on the view.
 pub(crate) fn render(
     room: &Room,
-    camera: &Camera,
+    camera: &Camera<IntrinsicsNorm>,
     width: usize,
     height: usize,
     side: usize,
     specular: f32,
 ) -> RgbImage {
-    let intrinsics = camera.intrinsics_norm.to_pixels(width, height);
+    let intrinsics = camera.intrinsics.to_pixels(width, height);
     let origin = camera.c2w.translation.as_vec3();
     let mut rgb = Vec::with_capacity(width * height * 3);
     for row in 0..height {
@@ -259,8 +258,9 @@ fn lamp_glow(room: &Room, hit: &Hit) -> Vec3 {
 
 #[cfg(test)]
 mod tests {
+    use clift_core::step_rng;
+
     use super::*;
-    use crate::random::step_rng;
     use crate::synthetic::config::SyntheticConfig;
 
     const RED: Vec3 = Vec3::new(1.0, 0.0, 0.0);
@@ -291,7 +291,7 @@ mod tests {
                 }
             }
             let [x, y, depth] = camera.c2w.inverse().apply(room.objects[0].center.as_dvec3()).to_array();
-            let pixels = camera.intrinsics_norm.to_pixels(192, 128);
+            let pixels = camera.intrinsics.to_pixels(192, 128);
             let center = [pixels.fx * x / depth + pixels.cx, pixels.fy * y / depth + pixels.cy];
             // The image of a ball off the axis is an ellipse whose middle lies outwards of the projected centre, by
             // less than (radius / depth)^2 of the distance from the axis.

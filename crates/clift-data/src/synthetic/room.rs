@@ -2,11 +2,11 @@
 
 use std::f32::consts::TAU;
 
+use clift_core::{uniform_01, uniform_below, uniform_between};
 use glam::{DVec3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::random::{uniform_01, uniform_below, uniform_between};
 use crate::synthetic::camera_path::{CLEARANCE, CameraPath};
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::tracing::surface::{Pattern, Surface, Wave, linear_color};
@@ -148,8 +148,8 @@ fn swing(rng: &mut impl Rng, size: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
     use crate::synthetic::config::LookDirection;
+    use clift_core::step_rng;
 
     /// Returns the distance from a point to the surface of an object, 0 inside.
     fn distance(object: &Object, point: Vec3) -> f32 {

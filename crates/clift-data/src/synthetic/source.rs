@@ -6,10 +6,9 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage, step_rng};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
-use crate::random::step_rng;
 use crate::scene_source::{SceneSource, Split};
 use crate::synthetic::config::{Look, SyntheticConfig};
 use crate::synthetic::ray_tracer;
@@ -88,7 +87,7 @@ impl SyntheticSource {
         }
     }
 
-    fn camera(&self, scene: &Scene, frame: usize) -> Camera {
+    fn camera(&self, scene: &Scene, frame: usize) -> Camera<IntrinsicsNorm> {
         let SyntheticConfig { num_frames, width, height, fov_deg, .. } = self.config;
         let time = frame as f64 / (num_frames - 1).max(1) as f64;
         let aspect = width as f64 / height as f64;
@@ -123,7 +122,7 @@ impl SceneSource for SyntheticSource {
         if scene < num_scenes { Ok(num_frames) } else { Err(DataError::NoSuchScene { scene, num_scenes }) }
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let scene = self.scene(scene)?;
         Ok((0..self.config.num_frames).map(|frame| self.camera(&scene, frame)).collect())
     }
@@ -189,8 +188,8 @@ mod tests {
         let wide = real(|c| (c.width, c.height) = (35, 21));
         assert_eq!(wide.frame(7, 3).unwrap().rgb.len(), 35 * 21 * 3);
         let (camera, square) = (wide.cameras(7).unwrap()[3], real(|_| ()).cameras(7).unwrap()[3]);
-        assert_eq!((camera.c2w, camera.intrinsics_norm.fx), (square.c2w, square.intrinsics_norm.fx));
-        let pixels = camera.intrinsics_norm.to_pixels(35, 21);
+        assert_eq!((camera.c2w, camera.intrinsics.fx), (square.c2w, square.intrinsics.fx));
+        let pixels = camera.intrinsics.to_pixels(35, 21);
         assert!((pixels.fx - pixels.fy).abs() < 1e-9);
     }
 
@@ -291,10 +290,10 @@ mod tests {
                 assert!(camera.c2w.orthonormality_defect() < 1e-12);
                 let [right, down] = [camera.c2w.rotation.x_axis, camera.c2w.rotation.y_axis];
                 assert!(right.y.abs() < 1e-12 && down.y > 0.1, "rolled or upside down: {right}, {down}");
-                let pixels = camera.intrinsics_norm.to_pixels(64, 32);
+                let pixels = camera.intrinsics.to_pixels(64, 32);
                 assert!((pixels.fx - pixels.fy).abs() < 1e-9, "pixels are square");
             }
-            let step = |pair: &[Camera]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
+            let step = |pair: &[Camera<IntrinsicsNorm>]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
             let length: f64 = cameras.windows(2).map(step).sum();
             let wanted = source.config.path_length;
             assert!((0.9 * wanted..1.3 * wanted).contains(&length), "scene {scene}: {length}");

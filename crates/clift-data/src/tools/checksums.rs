@@ -5,10 +5,10 @@ use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
+use clift_core::{TEMPORARY, replace_file};
 use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
-use crate::files::atomic::{TEMPORARY, replace_file};
 use crate::files::listing::has_ending;
 
 /// Name of the file, in the format of `sha256sum`: a line per file with checksum and name.

@@ -84,7 +84,7 @@ pub struct ConversionReport {
     pub skipped: SkipReport,
 }
 
-/// A copied image file that is no complete JPEG or PNG.
+/// A copied image file that is not a complete JPEG or PNG.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct UnreadableImage {
     /// Scene key.

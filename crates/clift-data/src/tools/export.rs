@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use clift_core::{RgbImage, replace_file};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
 use crate::image::codec::{encode_jpeg, encode_png};
 use crate::image::lanczos::resize_lanczos;
-use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::evaluation_index::even_views;
 use crate::scene_source::SceneSource;

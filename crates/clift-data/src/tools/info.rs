@@ -2,14 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use clift_core::{Camera, DVec3, IntrinsicsNorm, MinMedianMax};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkippedScene;
-use crate::statistics::MinMedianMax;
 
 /// Largest number of scenes whose image size is read.
 const MAX_SIZED_SCENES: usize = 1000;
@@ -85,13 +84,10 @@ impl SourceInfo {
 }
 
 /// Returns the largest distance of a camera centre from the mean centre along a world axis.
-fn extent(cameras: &[Camera]) -> f64 {
+fn extent(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
     let count = cameras.len() as f64;
-    let axis = |i: usize| {
-        let mean: f64 = cameras.iter().map(|camera| camera.c2w.translation[i] / count).sum();
-        cameras.iter().map(|camera| (camera.c2w.translation[i] - mean).abs()).fold(0.0, f64::max)
-    };
-    axis(0).max(axis(1)).max(axis(2))
+    let mean: DVec3 = cameras.iter().map(|camera| camera.c2w.translation / count).sum();
+    cameras.iter().map(|camera| (camera.c2w.translation - mean).abs().max_element()).fold(0.0, f64::max)
 }
 
 #[cfg(test)]

@@ -3,14 +3,15 @@
 use std::collections::HashSet;
 use std::path::Path;
 
+use clift_core::{
+    BadConfig, Camera, IntrinsicsNorm, check_config, derive_seed, sample_distinct, sample_from, step_rng,
+    uniform_between,
+};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::bad_config::{BadConfig, check_config};
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::geometry::overlap::overlap;
-use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkipReport;
@@ -64,7 +65,7 @@ impl OverlapOptions {
         let (most, frames) = if self.context_targets {
             (near + 1, "the frames of the smallest gap")
         } else {
-            (near + 1 - num_context, "the frames of the smallest gap that are no contexts")
+            (near + 1 - num_context, "the frames of the smallest gap that are not context views")
         };
         check_config((1..=most).contains(&num_targets), "num_targets", num_targets, || {
             format!("use 1 to {most}, {frames}")
@@ -77,7 +78,7 @@ impl OverlapOptions {
     /// Frames are visited in random order. The partner of a frame is uniform among the frames at increasing distance, in
     /// both directions, up to the first without enough overlap. The first frame with a partner is used. Targets are
     /// distinct and sorted; inner contexts are distinct and uniform.
-    fn sample_views(&self, key: &str, cameras: &[Camera]) -> Result<ViewIndices, String> {
+    fn sample_views(&self, key: &str, cameras: &[Camera<IntrinsicsNorm>]) -> Result<ViewIndices, String> {
         let num_frames = cameras.len();
         let [near, far] = self.distance;
         if num_frames <= near {
@@ -152,11 +153,10 @@ pub fn write_overlap_index(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
-    use crate::geometry::pose::Pose;
     use crate::sampling::evaluation_index::EvaluationIndex;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{self, TestSource};
+    use clift_core::Pose;
     use glam::DMat3;
 
     fn rooms(num_scenes: usize) -> SyntheticSource {
@@ -222,9 +222,9 @@ mod tests {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
         let camera = |frame: usize| {
             let rotation = DMat3::from_rotation_y((3.0 * frame as f64).to_radians());
-            Camera { intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
+            Camera { intrinsics: intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
         };
-        let cameras: Vec<Camera> = (0..60).map(camera).collect();
+        let cameras: Vec<Camera<IntrinsicsNorm>> = (0..60).map(camera).collect();
         let options = |near, far| OverlapOptions { num_targets: 1, distance: [near, far], ..OverlapOptions::default() };
         for key in ["a", "b", "c", "d", "e", "f"] {
             let ViewIndices { context, .. } = options(4, 50).sample_views(key, &cameras).unwrap();

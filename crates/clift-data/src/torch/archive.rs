@@ -81,7 +81,7 @@ impl Archive {
         let file_bytes = file.metadata().map_err(DataError::io("opening the chunk", path))?.len();
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| {
             bad(other_format(path).map_or_else(
-                || format!("the file of {file_bytes} bytes is no readable ZIP archive, perhaps truncated ({error})"),
+                || format!("the file of {file_bytes} bytes is not a readable ZIP archive, perhaps truncated ({error})"),
                 str::to_owned,
             ))
         })?;

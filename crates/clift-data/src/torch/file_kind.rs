@@ -28,7 +28,7 @@ pub(crate) fn require_file(path: &Path) -> Result<(), DataError> {
     Ok(())
 }
 
-/// Returns a description of a file that is no ZIP archive; `None` for an unknown format.
+/// Returns a description of a file that is not a ZIP archive; `None` for an unknown format.
 pub(crate) fn other_format(path: &Path) -> Option<&'static str> {
     other_kind(&read_start(path, NUM_BYTES)?, std::fs::metadata(path).ok()?.len())
 }

@@ -10,7 +10,7 @@
 //! - `pickle_writer`: write files for torch.load
 //! - `tensor_span`: byte range of a tensor
 //! - `state_dict`: weights of PyTorch checkpoints
-//! - `file_kind`: recognition of files that are no checkpoint
+//! - `file_kind`: recognition of files that are not checkpoints
 
 pub(crate) mod allow_list;
 pub(crate) mod archive;

@@ -6,10 +6,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use clift_core::replace_file;
 use half::{bf16, f16};
 
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::file_kind::require_file;
 use crate::torch::pickle::Pickle;
@@ -55,7 +55,7 @@ impl StateDict {
         let Value::Dict(items) = state else {
             let object =
                 if pickle.item(root, "state_dict").is_some() { "`state_dict`" } else { "the outermost object" };
-            return Err(bad(format!("{object} is no dict of tensors")));
+            return Err(bad(format!("{object} is not a dict of tensors")));
         };
         let mut tensors = BTreeMap::new();
         for (key, value) in items {
@@ -269,7 +269,7 @@ mod tests {
         assert!(read.iter().any(|result| matches!(result, Err(DataError::BadCheckpoint { .. }))));
         let chunk = fixture("../re10k-mini/test/000000.torch");
         let message = StateDict::open(&chunk).map(|_| ()).unwrap_err().to_string();
-        assert!(message.contains("the outermost object is no dict of tensors"), "{message}");
+        assert!(message.contains("the outermost object is not a dict of tensors"), "{message}");
         let message = StateDict::open(&fixture("none.ckpt")).map(|_| ()).unwrap_err().to_string();
         assert!(message.starts_with("opening the checkpoint failed"), "{message}");
     }
@@ -331,7 +331,7 @@ mod tests {
     #[test]
     fn objects_are_no_tensors() {
         let message = refused(b"}X\x0a\0\0\0state_dictcproject\nThing\n)\x81s.");
-        assert!(message.contains("`state_dict` is no dict of tensors"), "{message}");
+        assert!(message.contains("`state_dict` is not a dict of tensors"), "{message}");
         let message = refused(b"}X\x01\0\0\0xcproject\nThing\n)\x81s.");
         assert!(message.contains("neither the outermost object nor an entry `state_dict` holds tensors"), "{message}");
         assert!(refused(b"}(((((").contains("the pickle ends in the middle of"));

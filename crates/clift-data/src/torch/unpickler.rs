@@ -195,7 +195,7 @@ impl PickleMachine<'_> {
     /// Evaluates a call of an allowed name; these calls only describe data.
     fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, UnpickleError> {
         let Value::Tuple(arguments) = self.get(arguments) else {
-            return Err("a call whose arguments are no tuple".into());
+            return Err("a call whose arguments are not a tuple".into());
         };
         match (self.get(callee), &arguments[..]) {
             (Value::Global(Global::OrderedDict), []) => Ok(Value::Dict(Vec::new())),
@@ -221,14 +221,14 @@ impl PickleMachine<'_> {
 
     /// Reads a tuple of at most [`MAX_DIMENSIONS`] non-negative integers.
     fn counts(&self, id: ValueId) -> Result<Vec<u64>, UnpickleError> {
-        let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are no tuple".into()) };
+        let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are not a tuple".into()) };
         if items.len() > MAX_DIMENSIONS {
             let what = format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len());
             return Err(UnpickleError::Bad(what));
         }
         let count = |id: &ValueId| match self.get(*id) {
             Value::Int(count) => u64::try_from(*count).map_err(|_| "a tensor with a negative size or stride".into()),
-            _ => Err("a tensor with a size or stride that is no integer".into()),
+            _ => Err("a tensor with a size or stride that is not an integer".into()),
         };
         items.iter().map(count).collect()
     }

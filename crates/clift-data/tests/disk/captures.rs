@@ -4,9 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use clift_data::{
-    FileOptions, IntrinsicsNorm, Lens, OpenedSource, RgbImage, SceneSource, Undistortion, decode_image, encode_png,
-};
+use clift_core::{IntrinsicsNorm, RgbImage};
+use clift_data::{FileOptions, Lens, OpenedSource, SceneSource, Undistortion, decode_image, encode_png};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -27,7 +26,7 @@ fn capture(images: &[&str], transforms: &Value) -> (TempDir, OpenedSource) {
 fn angles_and_image_size_replace_missing_intrinsics() {
     let angle = 2.0 * (0.5_f64 / 0.8).atan();
     let (_root, opened) = capture(&["r_0.png"], &json!({"camera_angle_x": angle, "frames": [frame_at(0.0, "./r_0")]}));
-    let k = opened.source.cameras(0).unwrap()[0].intrinsics_norm;
+    let k = opened.source.cameras(0).unwrap()[0].intrinsics;
     // Square pixels.
     for (got, expected) in [(k.fx, 0.8), (k.fy, 0.8 * 24.0 / 16.0), (k.cx, 0.5), (k.cy, 0.5)] {
         assert!((got - expected).abs() < 1e-12, "{k:?}");
@@ -44,7 +43,7 @@ fn frame_intrinsics_override_and_scale_with_images() {
                      "frames": [frame_at(0.0, "images/a.png"), own]});
     let (_root, opened) = capture(&["images/a.png", "images/b.png"], &top);
     let cameras = opened.source.cameras(0).unwrap();
-    let [a, b] = [0, 1].map(|frame: usize| cameras[frame].intrinsics_norm);
+    let [a, b] = [0, 1].map(|frame: usize| cameras[frame].intrinsics);
     assert_eq!([a.fx, a.fy, a.cx, a.cy], [1.0, 1.125, 0.5, 0.45]);
     // The frame's fl_x holds for both axes and is not mixed with the fl_y of the top level.
     assert_eq!([b.fx, b.fy, b.cx, b.cy], [0.625, 0.9375, 0.25, 1.125]);
@@ -88,7 +87,7 @@ fn colmap_lenses_are_undistorted_unless_ignored() {
         let (root, image) = colmap(line);
         let (norm, lens) = (norm(fx, fy), Lens { radial: [radial[0], radial[1], 0.0], tangential });
         let ignored = open(root.path(), Some(false));
-        assert_eq!(ignored.cameras(0).unwrap()[0].intrinsics_norm, norm, "{line}");
+        assert_eq!(ignored.cameras(0).unwrap()[0].intrinsics, norm, "{line}");
         assert_eq!(ignored.frame(0, 0).unwrap(), image, "{line}");
         let source = open(root.path(), None);
         if lens.is_pinhole() {
@@ -96,7 +95,7 @@ fn colmap_lenses_are_undistorted_unless_ignored() {
             continue;
         }
         let undistortion = Undistortion::new(norm, lens).unwrap();
-        assert_eq!(source.cameras(0).unwrap()[0].intrinsics_norm, undistortion.intrinsics_norm(), "{line}");
+        assert_eq!(source.cameras(0).unwrap()[0].intrinsics, undistortion.intrinsics_norm(), "{line}");
         assert_eq!(source.frame(0, 0).unwrap(), undistortion.apply(&image), "{line}");
         assert_ne!(source.frame(0, 0).unwrap(), image, "{line}");
         assert_eq!(source.encoded_frame(0, 0).unwrap(), None, "no file holds the resampled image");

@@ -88,7 +88,7 @@ fn rotations_that_are_not_orthonormal_are_refused() {
 #[test]
 fn rotated_images_are_skipped_for_their_aspect_ratio() {
     let root = copy_of_layout("capture");
-    let image = clift_data::RgbImage { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
+    let image = clift_core::RgbImage { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
     let png = clift_data::encode_png(&image).unwrap();
     fs::write(root.path().join("attic/images/10.png"), &png).unwrap();
     fs::write(root.path().join("attic/images/11.png"), "no image").unwrap();

@@ -3,9 +3,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use clift_core::{PoseRotation, PoseScale};
 use clift_data::{
-    Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, PoseRotation, PoseScale, SceneFilters, SceneSource,
-    SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
+    Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, SceneFilters, SceneSource, SourceInfo, SourceKind,
+    SourceOptions, Split, ViewIndices,
 };
 
 use crate::files::{copy_folder, copy_of_layout, layout};
@@ -45,9 +46,8 @@ fn clip(source: Arc<dyn SceneSource>) -> Clip {
 
 fn numbers(clip: &Clip) -> Vec<f64> {
     let views = [&clip.context, &clip.target];
-    let poses = views.iter().flat_map(|views| views.c2w.iter().flat_map(|c2w| c2w.to_matrix_f64()));
-    let optics = views.iter().flat_map(|views| views.intrinsics.iter().flat_map(|k| [k.fx, k.fy, k.cx, k.cy]));
-    poses.chain(optics).collect()
+    let cameras = views.iter().flat_map(|views| &views.cameras);
+    cameras.flat_map(|camera| camera.c2w.to_matrix_f64().into_iter().chain(camera.intrinsics.to_array())).collect()
 }
 
 #[test]
@@ -85,7 +85,7 @@ fn cameras_equal_those_of_the_fixture_script() {
     for (name, split, ..) in LAYOUTS {
         let source = open_kind(&layout(name), split, SourceKind::Auto).source;
         let camera = source.cameras(0).unwrap()[3];
-        let k = camera.intrinsics_norm;
+        let k = camera.intrinsics;
         let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
         let got = camera.c2w.translation.to_array().into_iter().chain([k.fx, k.fy, k.cx, k.cy]);
         for (got, expected) in got.zip(expected) {

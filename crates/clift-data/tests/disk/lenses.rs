@@ -1,7 +1,8 @@
 //! Lens distortion against the camera models of COLMAP and the undistortion of OpenCV
 //! (`scripts/fixtures/make_layout_fixtures.py`).
 
-use clift_data::{IntrinsicsNorm, Lens, RgbImage, Undistortion};
+use clift_core::{IntrinsicsNorm, RgbImage};
+use clift_data::{Lens, Undistortion};
 use safetensors::SafeTensors;
 
 use crate::files::fixtures;

@@ -3,7 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{FileOptions, OpenedSource, RgbImage, decode_image, encode_jpeg, encode_png};
+use clift_core::RgbImage;
+use clift_data::{FileOptions, OpenedSource, decode_image, encode_jpeg, encode_png};
 use serde_json::{Value, json};
 
 use crate::files::{copy_of_layout, frame_at, write_capture};

@@ -6,18 +6,19 @@
 use std::ops::Range;
 
 use burn::tensor::Tensor;
-use clift_data::{Clip, ClipReader, EvaluationItem, derive_seed, item_rng, mean};
+use clift_core::{derive_seed, item_rng, mean};
+use clift_data::{Clip, ClipReader, EvaluationItem};
 use clift_model::{
     Cameras, Histograms, KMeans, LevelCounts, Moments, NeighbourProducts, Places, RateTable, TokenCodec, TokenCount,
-    TokenKind, Tokens, TrainedModel, Transform,
+    TokenKind, Tokens, TrainedModel, Transform, Views,
 };
 use rand::RngExt;
 
+use crate::encode::host_values;
 use crate::error::EvalError;
 use crate::evaluator::progress::EvalProgress;
 use crate::metrics::image_metrics::psnr_of_mse;
 use crate::sweep::compressed_tokens::with_values;
-use crate::upload::{host_values, upload_cameras, upload_views};
 
 /// Most scenes that transform and distributions are fitted on; each is read three times, with one of the counts.
 const MAX_FITTED_SCENES: usize = 64;
@@ -172,7 +173,7 @@ impl Fit<'_> {
 
     /// Returns the stored tokens of a scene, `[S, D]`, at one of the counts, and their patches.
     fn tokens(&self, clip: &Clip, index: usize) -> Result<(Vec<f32>, Vec<u32>), EvalError> {
-        let lift = self.model.network.encode(&upload_views(&[&clip.context], &self.model.device)?);
+        let lift = self.model.network.encode(&Views::upload(&[&clip.context], &self.model.device)?);
         let count = self.options.counts[index % self.options.counts.len()];
         let (tokens, ids) = self.stored(&lift, count, clip)?;
         Ok((host_values(&tokens)?, ids))
@@ -215,8 +216,8 @@ impl Fit<'_> {
         effects: &mut [Vec<f64>],
     ) -> Result<(), EvalError> {
         let device = &self.model.device;
-        let lift = self.model.network.encode(&upload_views(&[&clip.context], device)?);
-        let cameras = upload_cameras(&[&clip.target], device)?;
+        let lift = self.model.network.encode(&Views::upload(&[&clip.context], device)?);
+        let cameras = Cameras::upload(&[&clip.target], device)?;
         let (tokens, _) = self.stored(&lift, self.options.counts[index % self.options.counts.len()], clip)?;
         let (values, exact) = (host_values(&tokens)?, self.render(tokens.clone(), &cameras)?);
         let dim = transform.mean.len();
@@ -240,8 +241,8 @@ impl Fit<'_> {
     /// Adds bits and losses of a scene at every count and step.
     fn measure(&self, clip: &Clip, codec: &TokenCodec, rates: &mut Measured) -> Result<(), EvalError> {
         let device = &self.model.device;
-        let lift = self.model.network.encode(&upload_views(&[&clip.context], device)?);
-        let cameras = upload_cameras(&[&clip.target], device)?;
+        let lift = self.model.network.encode(&Views::upload(&[&clip.context], device)?);
+        let cameras = Cameras::upload(&[&clip.target], device)?;
         let truth: Vec<f32> = clip.target.images.iter().map(|&value| f32::from(value) / 255.0).collect();
         let render = |tokens: Tokens| self.render(tokens, &cameras);
         let view_len = truth.len() / clip.target.num_views();

@@ -17,7 +17,7 @@ const MAX_FACTOR: f64 = 16.0;
 const SIZE_SEARCH: usize = 32;
 
 /// Finds the largest step at which renderings of a scene lose at most `loss_db`. `scene` has tokens that are not rounded, and
-/// was encoded by `model` from scene `index` of `reader`; its loss is measured on frames that are no contexts, or on the
+/// was encoded by `model` from scene `index` of `reader`; its loss is measured on frames that are not context views, or on the
 /// contexts where there is no other frame. Returns the step and its loss in dB.
 ///
 /// # Errors
@@ -86,7 +86,7 @@ pub fn step_for_bytes(scene: &Scene, codec: &TokenCodec, bytes: u64) -> Result<(
 /// Returns the expected step of a scene for a loss.
 ///
 /// # Errors
-/// [`ModelError::NotDivisible`] for sizes that are no patches.
+/// [`ModelError::NotDivisible`] for sizes that are not patches.
 pub fn expected_step(scene: &Scene, codec: &TokenCodec, loss_db: f64) -> Result<f32, EvalError> {
     Ok(codec.rates.step_for_loss(share(scene)?, loss_db) as f32)
 }

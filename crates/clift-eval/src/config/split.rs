@@ -75,7 +75,7 @@ impl EvalFrames {
         even_views_of(&rest, targets, num_context, num_targets)
     }
 
-    /// Returns the split of the views of an index: frames that training reads are no held-out frames.
+    /// Returns the split of the views of an index: frames that training reads are not held-out frames.
     pub(crate) fn of_views<'a>(&self, mut views: impl Iterator<Item = &'a ViewIndices>) -> EvalSplit {
         let is_held_out = |views: &ViewIndices| views.target.iter().all(|frame| is_held_out(*frame, self.hold_out));
         if self.split == EvalSplit::HeldOutFrames && !views.all(is_held_out) { EvalSplit::Train } else { self.split }

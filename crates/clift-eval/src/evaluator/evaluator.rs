@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural, replace_file};
+use clift_core::replace_file;
+use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural};
 use clift_model::{Architecture, ModelError, TokenCoding};
 
 use crate::config::eval_config::EvalConfig;

@@ -5,7 +5,7 @@ use std::ffi::OsStr;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use clift_data::StagedDir;
+use clift_core::StagedDir;
 
 use crate::error::EvalError;
 use crate::figures::canvas::Canvas;

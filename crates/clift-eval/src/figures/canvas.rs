@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_data::replace_file;
+use clift_core::replace_file;
 use embedded_graphics::mono_font::{MonoFont, MonoTextStyle};
 use embedded_graphics::pixelcolor::{Rgb888, RgbColor};
 use embedded_graphics::prelude::{DrawTarget, Drawable, OriginDimensions, Pixel, Point, Size};

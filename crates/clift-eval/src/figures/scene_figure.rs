@@ -1,6 +1,7 @@
 //! The figures of one scene: a contact sheet at full size, and small images for the report.
 
-use clift_data::{Clip, ClipViews};
+use clift_core::ClipViews;
+use clift_data::Clip;
 use clift_model::SceneClusters;
 
 use crate::config::method::Method;

@@ -4,7 +4,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use clift_data::TEMPORARY;
+use clift_core::TEMPORARY;
 
 use crate::error::EvalError;
 use crate::figures::canvas::Canvas;

@@ -4,7 +4,8 @@ use std::io;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use clift_data::{SkipReport, replace_file};
+use clift_core::replace_file;
+use clift_data::SkipReport;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::error::EvalError;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_data::replace_file;
+use clift_core::replace_file;
 use clift_model::TokenCoding;
 use serde::Deserialize;
 

@@ -3,7 +3,7 @@
 //! Scenes differ far more than methods. The standard error is therefore computed from the differences within scenes, not
 //! from two means.
 
-use clift_data::{mean, standard_error};
+use clift_core::{mean, standard_error};
 use serde::Serialize;
 
 use crate::statistics::eval_results::SceneViews;

@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use clift_data::{mean, median, p95, quartiles, replace_file, standard_error};
+use clift_core::{mean, median, p95, quartiles, replace_file, standard_error};
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-use clift_data::mean;
+use clift_core::mean;
 use clift_model::TokenCoding;
 use serde::{Deserialize, Serialize};
 

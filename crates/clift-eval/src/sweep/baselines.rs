@@ -1,6 +1,6 @@
 //! Baselines: the nearest context view, and the mean of all context views.
 
-use clift_data::{ClipViews, Pose};
+use clift_core::{Camera, ClipViews, Pose};
 
 use crate::error::EvalError;
 
@@ -9,12 +9,13 @@ use crate::error::EvalError;
 const TIE: f64 = 1e-9;
 
 /// Finds the nearest camera centre. Ties go to the smaller rotation angle, then to the lower index.
-pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, EvalError> {
-    let distances: Vec<f64> = context_c2w.iter().map(|c2w| c2w.translation.distance(target_c2w.translation)).collect();
+pub fn nearest_view(context: &[Camera], target: Pose) -> Result<usize, EvalError> {
+    let distances: Vec<f64> =
+        context.iter().map(|camera| camera.c2w.translation.distance(target.translation)).collect();
     let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
     let tie = TIE * distances.iter().copied().fold(0.0, f64::max);
     let near: Vec<usize> = (0..distances.len()).filter(|&i| distances[i] <= nearest + tie).collect();
-    let angles: Vec<f64> = near.iter().map(|&i| context_c2w[i].angle_to(target_c2w)).collect();
+    let angles: Vec<f64> = near.iter().map(|&i| context[i].c2w.angle_to(target)).collect();
     let smallest = angles.iter().copied().fold(f64::INFINITY, f64::min);
     let first = angles.iter().position(|&angle| angle <= smallest + TIE).ok_or(EvalError::NoContext)?;
     Ok(near[first])
@@ -27,8 +28,8 @@ pub(crate) fn view_image(views: &ClipViews, view: usize) -> Vec<f32> {
 }
 
 /// Returns the image of the nearest context view, `[height, width, 3]` in [0, 1].
-pub fn nearest_image(context: &ClipViews, target_c2w: Pose) -> Result<Vec<f32>, EvalError> {
-    Ok(view_image(context, nearest_view(&context.c2w, target_c2w)?))
+pub fn nearest_image(context: &ClipViews, target: Pose) -> Result<Vec<f32>, EvalError> {
+    Ok(view_image(context, nearest_view(&context.cameras, target)?))
 }
 
 /// Returns the mean of the context images, `[height, width, 3]` in [0, 1].
@@ -48,7 +49,7 @@ pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{DMat3, DVec3};
+    use clift_core::{DMat3, DVec3};
 
     use super::*;
     use crate::testing::gray_views;
@@ -69,7 +70,7 @@ mod tests {
             ([pose(1.0, 20.0), pose(-1.0, 0.0)], pose(0.0, 10.0), 0, "index at equal angle"),
             ([pose(1.0 - 1e-14, 90.0), pose(1.0, 1.0)], pose(0.0, 0.0), 1, "a rounding difference is a tie"),
         ] {
-            assert_eq!(nearest_view(&context, target).unwrap(), expected, "{case}");
+            assert_eq!(nearest_view(&views(&context, Vec::new()).cameras, target).unwrap(), expected, "{case}");
         }
     }
 

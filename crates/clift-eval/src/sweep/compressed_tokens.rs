@@ -2,18 +2,17 @@
 // N encoder tokens, S stored tokens, R rendered tokens, D width
 
 use burn::tensor::{Tensor, TensorData};
-use clift_data::{Clip, Pose, item_rng};
-use clift_model::{
-    Scene, SceneNormalization, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes,
-};
+use clift_core::{Pose, PoseNormalization, item_rng};
+use clift_data::Clip;
+use clift_model::{Scene, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
 use crate::config::method::Method;
+use crate::encode::host_values;
 use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
-use crate::upload::{host_values, view_cameras};
 
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
@@ -113,9 +112,9 @@ fn scene_of(clip: &Clip, codec: &TokenCodec, ids: &[u32], tokens: Vec<f32>, mode
         model_path: model_path.into(),
         height: clip.context.height,
         width: clip.context.width,
-        context: view_cameras(&clip.context),
+        context: clip.context.cameras.clone(),
         context_frames: clip.context.frame_index.iter().map(|&frame| frame as u32).collect(),
-        world: SceneNormalization { mean_c2w: Pose::IDENTITY.to_matrix_f64(), scale: 1.0 },
+        world: PoseNormalization { mean_c2w: Pose::IDENTITY, scale: 1.0 },
         token_ids: ids.into(),
         tokens,
     }

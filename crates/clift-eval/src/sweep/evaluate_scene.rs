@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::time::Instant;
 
-use clift_data::{Clip, derive_seed, median};
+use clift_core::{derive_seed, median};
+use clift_data::Clip;
 use clift_model::{Cameras, FlopConvention, Grouping, TokenCoding, Tokens, TrainedModel, Views};
 
 use crate::config::method::Method;
@@ -19,7 +20,6 @@ use crate::sweep::sweep::Sweep;
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
 use crate::system::memory;
-use crate::upload::{upload_cameras, upload_views};
 
 /// Largest time of the repeated renderings of one scene, in seconds.
 const MAX_REPETITION_S: f64 = 5.0;
@@ -40,10 +40,10 @@ pub fn evaluate_scene(
     metrics: &mut EvalResults,
 ) -> Result<Option<SceneResults>, EvalError> {
     let device = &models.stage1.device;
-    let context = upload_views(&[&clip.context], device)?;
+    let context = Views::upload(&[&clip.context], device)?;
     let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
     let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
-    let renderer = TargetRenderer { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
+    let renderer = TargetRenderer { clip, scorer: &scorer, cameras: Cameras::upload(&[&clip.target], device)?, sweep };
     let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
     for rendering in &results.renderings {
         record(clip, rendering, metrics)?;

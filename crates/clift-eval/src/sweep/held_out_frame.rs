@@ -1,17 +1,17 @@
-//! A check of an encoded scene: a frame that is no context, rendered and compared with the nearest context view.
+//! A check of an encoded scene: a frame that is not a context view, rendered and compared with the nearest context view.
 
-use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices};
-use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel, ViewCamera};
+use clift_core::Camera;
+use clift_data::{ClipReader, ViewIndices};
+use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel};
 
 use crate::error::EvalError;
 use crate::metrics::image_metrics::psnr;
 use crate::sweep::baselines::{nearest_image, view_image};
-use crate::upload::view_cameras;
 
 /// Largest number of frames that are tried: images may be unreadable.
 const MAX_TRIES: usize = 3;
 
-/// A frame that is no context, rendered from the stored tokens.
+/// A frame that is not a context view, rendered from the stored tokens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HeldOutFrame {
     /// The frame of the scene.
@@ -48,7 +48,7 @@ impl HeldOutFrame {
 /// Frames of a scene with true images, in the poses of its file.
 pub(crate) struct CheckViews {
     pub frames: Vec<usize>,
-    pub cameras: Vec<ViewCamera>,
+    pub cameras: Vec<Camera>,
     /// RGB in `[0, 1]` of all frames, `[V, height, width, 3]`.
     pub truth: Vec<f32>,
     /// Height and width.
@@ -58,7 +58,7 @@ pub(crate) struct CheckViews {
 }
 
 impl CheckViews {
-    /// Reads up to `count` frames that are no contexts, the first [`candidates`]; `None` if none is readable.
+    /// Reads up to `count` frames that are not context views, the first [`candidates`]; `None` if none is readable.
     pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, EvalError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let frames = candidates(&context, reader.source.cameras(index)?.len());
@@ -79,20 +79,20 @@ impl CheckViews {
     fn of_frames(reader: &ClipReader, index: usize, scene: &Scene, frames: &[usize]) -> Result<Self, EvalError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let cameras = reader.source.cameras(index)?;
-        let normalization =
-            PoseNormalization { mean_c2w: Pose::from_matrix(&scene.world.mean_c2w)?, scale: scene.world.scale };
         let mut clip = reader.read(index, &ViewIndices { context, target: frames.to_vec() })?;
         // The poses of the scene file: `reader` may normalize by the target too.
         for views in [&mut clip.context, &mut clip.target] {
-            views.c2w = views.frame_index.iter().map(|&i| normalization.normalize(cameras[i].c2w)).collect();
+            for (camera, &frame) in views.cameras.iter_mut().zip(&views.frame_index) {
+                camera.c2w = scene.world.normalize(cameras[frame].c2w);
+            }
         }
         let nearest: Result<Vec<_>, _> =
-            clip.target.c2w.iter().map(|&pose| nearest_image(&clip.context, pose)).collect();
+            clip.target.cameras.iter().map(|camera| nearest_image(&clip.context, camera.c2w)).collect();
         Ok(Self {
             frames: frames.to_vec(),
-            cameras: view_cameras(&clip.target),
             truth: (0..frames.len()).flat_map(|view| view_image(&clip.target, view)).collect(),
             size: [clip.target.height, clip.target.width],
+            cameras: clip.target.cameras,
             nearest: nearest?,
         })
     }
@@ -102,7 +102,7 @@ impl CheckViews {
 pub(crate) fn render_scene(
     model: &TrainedModel,
     scene: &Scene,
-    views: &[ViewCamera],
+    views: &[Camera],
     [height, width]: [usize; 2],
 ) -> Result<Vec<Vec<f32>>, EvalError> {
     let rules = SelectionPreset::Paper.rules();
@@ -111,7 +111,7 @@ pub(crate) fn render_scene(
     Ok(rendered.into_iter().map(|view| view.pixels).collect())
 }
 
-/// Returns the frames that are no contexts: those between the contexts, the farthest from a context first, then the others,
+/// Returns the frames that are not context views: those between the contexts, the farthest from a context first, then the others,
 /// the nearest first.
 fn candidates(context: &[usize], num_frames: usize) -> Vec<usize> {
     let mut frames: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();

@@ -5,7 +5,8 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{Clip, derive_seed};
+use clift_core::derive_seed;
+use clift_data::Clip;
 use image::{DynamicImage, ImageReader, Limits};
 
 use crate::config::method::{Method, MethodName};
@@ -105,7 +106,7 @@ fn read_image(path: &Path, height: usize, width: usize) -> Result<Vec<f32>, Eval
 
 #[cfg(test)]
 mod tests {
-    use clift_data::Pose;
+    use clift_core::Pose;
 
     use super::*;
     use crate::figures::canvas::Canvas;

@@ -77,8 +77,8 @@ pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, kept_views: &[usize]) 
     let mean = mean_image(&clip.context)?;
     let mut nearest = ScoredViews::new(EvalKey::baseline(Method::NearestView));
     let mut means = ScoredViews::new(EvalKey::baseline(Method::MeanImage));
-    for (view, &pose) in clip.target.c2w.iter().enumerate() {
-        nearest.add(view, nearest_image(&clip.context, pose)?, scorer, kept_views)?;
+    for (view, camera) in clip.target.cameras.iter().enumerate() {
+        nearest.add(view, nearest_image(&clip.context, camera.c2w)?, scorer, kept_views)?;
         means.add(view, mean.clone(), scorer, kept_views)?;
     }
     Ok(vec![nearest, means])

@@ -3,13 +3,13 @@
 
 use std::time::Instant;
 
-use clift_data::{Clip, item_rng};
+use clift_core::{ClipViews, item_rng};
+use clift_data::Clip;
 use clift_model::{ModelError, Selector, TokenRay};
 
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
 use crate::sweep::compressed_tokens::random_subset;
-use crate::upload::view_cameras;
 
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct SelectedTokens {
@@ -39,11 +39,10 @@ pub(crate) fn select_for_views(
             Ok(random_subset(ids.len(), num_render_tokens, rng))
         }),
         Some(preset) => {
-            let context = view_cameras(&clip.context);
-            let rays = TokenRay::of_patches(ids, &context, clip.context.height, clip.context.width, patch_size);
+            let ClipViews { cameras, height, width, .. } = &clip.context;
+            let rays = TokenRay::of_patches(ids, cameras, *height, *width, patch_size);
             let mut selector = Selector::new(preset.rules(), &rays)?;
-            let cameras = view_cameras(target);
-            Box::new(move |view| selector.select(&cameras[view], target.height, target.width, num_render_tokens))
+            Box::new(move |view| selector.select(&target.cameras[view], target.height, target.width, num_render_tokens))
         }
     };
     let mut selected = vec![SelectedTokens { tokens: Vec::new(), select_s: 0.0 }; order.len()];
@@ -57,7 +56,7 @@ pub(crate) fn select_for_views(
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{ClipViews, Pose};
+    use clift_core::Pose;
 
     use super::*;
     use crate::testing::gray_views;

@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-use clift_data::ClipViews;
+use clift_core::ClipViews;
 
 use crate::error::EvalError;
 use crate::metrics::image_metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};

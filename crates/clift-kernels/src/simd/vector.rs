@@ -175,7 +175,7 @@ fn array<S: Simd>(simd: S, vector: S::V) -> [f32; MAX_LANES] {
     array
 }
 
-/// What the lanes of the operands of a matrix product hold.
+/// Values in the lanes of the operands of a matrix product.
 pub trait Operands: Copy + Send + Sync + 'static {
     /// Values per lane, neighbours along the inner dimension.
     const PER_LANE: usize;

@@ -3,11 +3,11 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use clift_core::replace_file;
 use safetensors::tensor::{Dtype, TensorView};
 use safetensors::{SafeTensors, serialize};
 use sha2::{Digest, Sha256};
 
-use crate::atomic_files::replace;
 use crate::codec::histogram::Distributions;
 use crate::codec::prediction::{NUM_CLASSES, Prediction};
 use crate::codec::rates::RateTable;
@@ -65,14 +65,14 @@ impl TokenCodec {
     /// # Errors
     /// [`ModelError::CodecFile`].
     pub fn write(&self, path: &Path) -> Result<(), ModelError> {
-        let written = to_bytes(self).and_then(|bytes| replace(path, &bytes).map_err(|error| error.to_string()));
+        let written = to_bytes(self).and_then(|bytes| replace_file(path, &bytes).map_err(|error| error.to_string()));
         written.map_err(|reason| ModelError::CodecFile { action: "writing", reason, path: path.into() })
     }
 
     /// Reads and checks a codec.
     ///
     /// # Errors
-    /// [`ModelError::NoCodec`] without the file, [`ModelError::CodecFile`] for a file that is no codec, is damaged or
+    /// [`ModelError::NoCodec`] without the file, [`ModelError::CodecFile`] for a file that is not a codec, is damaged or
     /// inconsistent.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         let size = match std::fs::metadata(path) {
@@ -203,7 +203,7 @@ fn check_transform(transform: &Transform) -> Result<(), String> {
 fn check_distributions(distributions: &Distributions) -> Result<(), String> {
     let Distributions { knots, cumulative } = distributions;
     if knots.len() < 2 || !knots.windows(2).all(|pair| pair[0] < pair[1]) {
-        return Err("the knots are no ascending numbers".into());
+        return Err("the knots are not ascending numbers".into());
     }
     let is_distribution =
         |row: &[f32]| row[0] == 0.0 && row[row.len() - 1] == 1.0 && row.windows(2).all(|pair| pair[0] <= pair[1]);

@@ -1,4 +1,4 @@
-//! Coefficients predicted from those of earlier tokens of the same view.
+//! Prediction of coefficients from earlier tokens of the same view.
 //!
 //! Neighbouring patches have similar tokens. A coefficient is expected at `w a + v b`, where `a` and `b` are those of the two
 //! nearest tokens before it. The weights and the deviation from the expected value depend on the direction, and on how far

@@ -33,7 +33,7 @@ pub struct TokenCodec {
     pub renderer_hash: String,
     /// The transform.
     pub transform: Transform,
-    /// How coefficients follow from those of neighbouring tokens.
+    /// Prediction of coefficients from neighbouring tokens.
     pub prediction: Prediction,
     /// The distribution of every coefficient around its expected value.
     pub distributions: Distributions,

@@ -45,7 +45,7 @@ impl Architecture {
     }
 }
 
-/// Variant of the network: that of its paper, or one of the released code's.
+/// Variant of the network: as in its paper, or as in the released code.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
@@ -83,7 +83,7 @@ impl CliftVariant {
     }
 }
 
-/// How attention knows the cameras. The rays of all pixels are inputs of the networks in every case.
+/// Camera information in attention. The rays of all pixels are inputs of the networks in every case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]

@@ -1,4 +1,4 @@
-//! How attention knows the cameras: the transforms of camera-relative attention (GTA, arXiv 2310.10375; `PRoPE`,
+//! Camera information in attention: the transforms of camera-relative attention (GTA, arXiv 2310.10375; `PRoPE`,
 //! arXiv 2507.10496).
 //!
 //! Every token has a block-diagonal matrix `rho`, made of the world-to-camera matrix `g` of its view and of rotations by

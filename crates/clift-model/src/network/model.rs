@@ -131,7 +131,7 @@ mod tests {
         assert_equals_pytorch("lvsm_stock", &small(small_lvsm(CliftVariant::ReleasedRe10k)));
     }
 
-    /// What a fixture has results of, and the weights.
+    /// Weights and outputs of one forward pass.
     struct ForwardPass {
         encoder: Encoder,
         renderer: Renderer,

@@ -6,7 +6,7 @@ use crate::network::blocks::block::DecoderBlock;
 use crate::network::camera_encoding::upload_ids;
 use crate::network::tokens::Tokens;
 
-/// What the blocks of a renderer read of a scene, the same for all of its views.
+/// Input of the renderer's blocks from a scene, the same for all of its views.
 #[derive(Clone, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a scene has one cache")]
 pub enum KeyValueCache {

@@ -100,7 +100,7 @@ pub struct LinearLayer {
     precision: Precision,
 }
 
-/// What the gradients of [`LinearLayer`] need.
+/// Values saved for the gradients of [`LinearLayer`].
 #[derive(Clone, Debug)]
 pub struct SavedLinear<T> {
     x: SavedTensor<T>,
@@ -150,7 +150,7 @@ struct NormLinear {
     precision: Precision,
 }
 
-/// What the gradients of [`NormLinear`] need.
+/// Values saved for the gradients of [`NormLinear`].
 #[derive(Clone, Debug)]
 struct SavedNormLinear<T> {
     norm: LayerNormInputs<T>,

@@ -1,18 +1,15 @@
 //! Rules of a valid scene, checked before a scene is written and after it is read, because files may be hostile.
 
+use clift_core::{Camera, CameraError, check_near};
+
 use crate::scene::scene::{HEADER_BYTES, Scene};
 use crate::tokens::kind::TokenKind;
-use crate::views::camera::ViewCamera;
 
 const MAX_VIEWS: usize = 1024;
 /// Longest side of a context view or a rendered image in pixels.
 pub const MAX_SIDE_PX: usize = 1 << 14;
 /// Most patches of all context views. Every patch is one encoder token.
 const MAX_PATCHES: usize = 1 << 20;
-/// Largest coordinate of a context camera; those of normalized cameras are at most 1.
-const MAX_COORDINATE: f64 = 1e3;
-/// Largest error of `R^T R` in a pose, as in the readers of data sets.
-const MAX_ROTATION_ERROR: f64 = 1e-2;
 
 impl Scene {
     /// Returns a message about the first invalid field.
@@ -20,9 +17,9 @@ impl Scene {
         let num_patches = self.check_views()?;
         self.check_tokens(num_patches)?;
         for (view, camera) in self.context.iter().enumerate() {
-            check_camera(camera).map_err(|reason| format!("context camera {view}: {reason}"))?;
+            check_camera(camera).map_err(|error| format!("context camera {view}: {error}"))?;
         }
-        check_pose(&self.world.mean_c2w).map_err(|reason| format!("mean pose: {reason}"))?;
+        self.world.mean_c2w.validate().map_err(|error| format!("mean pose: {error}"))?;
         if !(self.world.scale > 0.0 && self.world.scale.is_finite()) {
             return Err(format!("pose scale {}, expected a positive number", self.world.scale));
         }
@@ -96,36 +93,8 @@ impl Scene {
     }
 }
 
-fn check_camera(camera: &ViewCamera) -> Result<(), String> {
-    let [fx, fy, cx, cy] = camera.intrinsics;
-    if !(fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|value| value.is_finite())) {
-        return Err(format!("intrinsics {:?}, expected finite values and positive focal lengths", camera.intrinsics));
-    }
-    check_pose(&camera.c2w)?;
-    let position = [3, 7, 11].map(|i| camera.c2w[i]);
-    if position.iter().any(|value| value.abs() > MAX_COORDINATE) {
-        return Err(format!("position {position:?}, expected coordinates up to {MAX_COORDINATE}"));
-    }
-    Ok(())
-}
-
-fn check_pose(c2w: &[f64; 16]) -> Result<(), String> {
-    if let Some(value) = c2w.iter().find(|value| !value.is_finite()) {
-        return Err(format!("the pose contains {value}"));
-    }
-    let product = |i: usize, j: usize| (0..3).map(|k| c2w[4 * k + i] * c2w[4 * k + j]).sum::<f64>();
-    let deviation = |i: usize, j: usize| (product(i, j) - f64::from(u8::from(i == j))).abs();
-    let error = (0..9).map(|entry| deviation(entry / 3, entry % 3)).fold(0.0, f64::max);
-    if c2w[12..] != [0.0, 0.0, 0.0, 1.0] {
-        return Err(format!("last row {:?} of the pose, expected [0, 0, 0, 1]", &c2w[12..]));
-    }
-    if error > MAX_ROTATION_ERROR {
-        return Err(format!("the rotation differs from an orthonormal matrix by {error:.1e}"));
-    }
-    let row = |i: usize| [c2w[4 * i], c2w[4 * i + 1], c2w[4 * i + 2]];
-    let ([a, b, c], [d, e, f], [x, y, z]) = (row(0), row(1), row(2));
-    if (b * f - c * e) * x + (c * d - a * f) * y + (a * e - b * d) * z < 0.0 {
-        return Err("the rotation mirrors".to_owned());
-    }
-    Ok(())
+fn check_camera(camera: &Camera) -> Result<(), CameraError> {
+    camera.intrinsics.validate()?;
+    camera.c2w.validate()?;
+    check_near(&camera.c2w)
 }

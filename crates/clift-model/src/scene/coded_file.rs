@@ -20,7 +20,8 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use crate::atomic_files::replace;
+use clift_core::replace_file;
+
 use crate::codec::prediction::Places;
 use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
@@ -92,7 +93,7 @@ impl Scene {
         self.check().map_err(|reason| refuse(reason, "encode other views or fewer tokens"))?;
         let bytes = self.coded_bytes(codec, step)?;
         check_output_path(path)?;
-        replace(path, &bytes).map_err(|error| refuse(error.to_string(), WRITABLE_FOLDER))
+        replace_file(path, &bytes).map_err(|error| refuse(error.to_string(), WRITABLE_FOLDER))
     }
 }
 

@@ -1,10 +1,8 @@
 //! Normalization and context views of a coded scene file.
 // V context views
 
-use glam::{DMat3, DMat4, DQuat, DVec3};
-
-use crate::scene::scene::SceneNormalization;
-use crate::views::camera::ViewCamera;
+use clift_core::{Camera, DMat3, Pose, PoseNormalization};
+use glam::DQuat;
 
 /// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
 const WORLD_BYTES: usize = 4 * 4 + 4 * 8;
@@ -14,34 +12,34 @@ const INTRINSICS_BYTES: usize = 4 * 4;
 
 /// Adds the normalization. As in the views, a rotation is stored as a unit quaternion: what is not orthonormal in its matrix,
 /// up to the tolerance of the check, is lost.
-pub(crate) fn write_world(world: &SceneNormalization, body: &mut Vec<u8>) {
-    body.extend(f32_bytes(&quaternion(&world.mean_c2w)));
-    let [x, y, z] = [3, 7, 11].map(|i| world.mean_c2w[i]);
+pub(crate) fn write_world(world: &PoseNormalization, body: &mut Vec<u8>) {
+    body.extend(f32_bytes(&quaternion(world.mean_c2w)));
+    let [x, y, z] = world.mean_c2w.translation.to_array();
     body.extend([x, y, z, world.scale].into_iter().flat_map(f64::to_le_bytes));
 }
 
 /// Reads the normalization; returns it and the rest of the bytes. `None` if there are too few bytes.
-pub(crate) fn read_world(bytes: &[u8]) -> Option<(SceneNormalization, &[u8])> {
+pub(crate) fn read_world(bytes: &[u8]) -> Option<(PoseNormalization, &[u8])> {
     let (bytes, rest) = bytes.split_at_checked(WORLD_BYTES)?;
     let [x, y, z, scale] = doubles(&bytes[16..]);
-    Some((SceneNormalization { mean_c2w: pose(floats(bytes), [x, y, z]), scale }, rest))
+    Some((PoseNormalization { mean_c2w: pose(floats(bytes), [x, y, z]), scale }, rest))
 }
 
 /// Adds the number of intrinsics, which is 1 if those of all views are equal, the intrinsics, and the views.
-pub(crate) fn write_views(context: &[ViewCamera], frames: &[u32], body: &mut Vec<u8>) {
-    let intrinsics: Vec<Vec<u8>> = context.iter().map(|camera| f32_bytes(&camera.intrinsics)).collect();
+pub(crate) fn write_views(context: &[Camera], frames: &[u32], body: &mut Vec<u8>) {
+    let intrinsics: Vec<Vec<u8>> = context.iter().map(|camera| f32_bytes(&camera.intrinsics.to_array())).collect();
     let count = if intrinsics.windows(2).all(|pair| pair[0] == pair[1]) { 1 } else { intrinsics.len() };
     body.extend((count as u32).to_le_bytes());
     body.extend(intrinsics[..count].concat());
     for (camera, frame) in context.iter().zip(frames) {
-        body.extend(f32_bytes(&quaternion(&camera.c2w)));
-        body.extend(f32_bytes(&camera.origin()));
+        body.extend(f32_bytes(&quaternion(camera.c2w)));
+        body.extend(f32_bytes(&camera.c2w.translation.to_array()));
         body.extend(frame.to_le_bytes());
     }
 }
 
 /// Cameras and frame numbers.
-type Views = (Vec<ViewCamera>, Vec<u32>);
+type Views = (Vec<Camera>, Vec<u32>);
 
 /// Reads `views` views; returns cameras, frame numbers and the rest of the bytes. `None` if there are too few bytes.
 pub(crate) fn read_views(views: usize, bytes: &[u8]) -> Option<(Views, &[u8])> {
@@ -56,20 +54,19 @@ pub(crate) fn read_views(views: usize, bytes: &[u8]) -> Option<(Views, &[u8])> {
     let view = |(i, bytes): (usize, &[u8])| {
         let c2w = pose(floats(bytes), floats(&bytes[16..]));
         let frame = u32::from_le_bytes(bytes[VIEW_BYTES - 4..].try_into().expect("the last 4 bytes of a view"));
-        (ViewCamera { c2w, intrinsics: intrinsics[i.min(count - 1)] }, frame)
+        (Camera { c2w, intrinsics: intrinsics[i.min(count - 1)].into() }, frame)
     };
     Some((bytes.chunks_exact(VIEW_BYTES).enumerate().map(view).unzip(), rest))
 }
 
 /// Returns the pose of a quaternion and a center. That of damaged numbers contains NaN, which the check of the scene finds.
-fn pose(quaternion: [f64; 4], center: [f64; 3]) -> [f64; 16] {
-    let rotation = DQuat::from_array(quaternion).normalize();
-    DMat4::from_rotation_translation(rotation, DVec3::from_array(center)).transpose().to_cols_array()
+fn pose(quaternion: [f64; 4], center: [f64; 3]) -> Pose {
+    Pose { rotation: DMat3::from_quat(DQuat::from_array(quaternion).normalize()), translation: center.into() }
 }
 
 /// Returns the rotation of a pose, `x, y, z, w`.
-fn quaternion(c2w: &[f64; 16]) -> [f64; 4] {
-    DQuat::from_mat3(&DMat3::from_mat4(DMat4::from_cols_array(c2w).transpose())).to_array()
+fn quaternion(c2w: Pose) -> [f64; 4] {
+    DQuat::from_mat3(&c2w.rotation).to_array()
 }
 
 fn f32_bytes(values: &[f64]) -> Vec<u8> {

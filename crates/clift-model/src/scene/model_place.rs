@@ -2,7 +2,8 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use crate::atomic_files::folder_of;
+use clift_core::folder_of;
+
 use crate::scene::scene::Scene;
 
 impl Scene {

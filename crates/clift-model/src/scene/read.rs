@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use clift_core::{Camera, Pose, PoseNormalization};
 use safetensors::{SafeTensorError, SafeTensors};
 
 use crate::codec::token_codec::TokenCodec;
@@ -11,10 +12,9 @@ use crate::network::config::ModelConfig;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
-use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, SceneNormalization, VERSION, dtype_name};
+use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, VERSION, dtype_name};
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
-use crate::views::camera::ViewCamera;
 use crate::weights::model_path::ModelPath;
 use crate::weights::tensors::Tensors;
 
@@ -33,7 +33,7 @@ impl Scene {
     /// Reads and checks a scene file. Coded tokens need the codec of the scene's model, see [`find_model`](Self::find_model).
     ///
     /// # Errors
-    /// [`ModelError::SceneFile`] for a file that is no scene, has another version, is truncated or inconsistent, and for
+    /// [`ModelError::SceneFile`] for a file that is not a scene, has another version, is truncated or inconsistent, and for
     /// coded tokens without their codec.
     pub fn read(path: &Path) -> Result<(Self, TokenCoding), ModelError> {
         Self::read_for(path, None)
@@ -89,7 +89,7 @@ fn from_bytes(
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?;
     let fields = Fields(metadata.metadata().clone().unwrap_or_default());
     if fields.0.get("format").map(String::as_str) != Some(FORMAT) {
-        return Err(refusal("the file is no scene: its header lacks the scene format", GIVE_ANOTHER));
+        return Err(refusal("the file is not a scene: its header lacks the scene format", GIVE_ANOTHER));
     }
     let version = fields.get("version")?;
     if version == CODED_VERSION {
@@ -111,9 +111,14 @@ fn from_bytes(
     let views = tensors.length("context_frames")?;
     let poses = tensors.f64s("context_c2w", &[views, 4, 4])?;
     let intrinsics = tensors.f64s("context_intrinsics", &[views, 4])?;
-    let cameras = poses.as_chunks::<16>().0.iter().zip(intrinsics.as_chunks::<4>().0);
+    let cameras = poses.as_chunks().0.iter().zip(intrinsics.as_chunks::<4>().0).enumerate();
+    let cameras = cameras.map(|(view, (matrix, &intrinsics))| {
+        let c2w = Pose::from_matrix(matrix).map_err(|error| format!("context camera {view}: {error}"))?;
+        Ok(Camera { c2w, intrinsics: intrinsics.into() })
+    });
     let mut mean_c2w = [0.0; 16];
     mean_c2w.copy_from_slice(&tensors.f64s("world_mean_c2w", &[4, 4])?);
+    let mean_c2w = Pose::from_matrix(&mean_c2w).map_err(|error| format!("mean pose: {error}"))?;
     let scene = Scene {
         key: fields.get("key")?.into(),
         kind,
@@ -121,9 +126,9 @@ fn from_bytes(
         model_path: fields.get("model_path")?.into(),
         height: fields.count("height")?,
         width: fields.count("width")?,
-        context: cameras.map(|(&c2w, &intrinsics)| ViewCamera { c2w, intrinsics }).collect(),
+        context: cameras.collect::<Result<_, String>>()?,
         context_frames: tensors.u32s("context_frames", &[views])?,
-        world: SceneNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
+        world: PoseNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
         token_ids: if model.has_patch_tokens() {
             tensors.u32s("token_ids", &[num_tokens])?
         } else {

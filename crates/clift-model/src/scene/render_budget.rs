@@ -2,9 +2,10 @@
 
 use std::time::Instant;
 
+use clift_core::{Camera, median};
+
 use crate::error::ModelError;
 use crate::scene::scene_renderer::SceneRenderer;
-use crate::views::camera::ViewCamera;
 
 /// Timed shares of the storage tokens, in sixteenths, besides all tokens.
 const SIXTEENTHS: [usize; 5] = [1, 2, 4, 8, 12];
@@ -29,7 +30,7 @@ impl RenderBudget {
     /// As [`SceneRenderer::render`].
     pub fn measure(
         renderer: &mut SceneRenderer,
-        view: &ViewCamera,
+        view: &Camera,
         height: usize,
         width: usize,
     ) -> Result<Self, ModelError> {
@@ -89,7 +90,7 @@ impl RenderBudget {
 /// Measures the median seconds per frame after one warm-up call.
 fn median_s(
     renderer: &mut SceneRenderer,
-    views: &[ViewCamera],
+    views: &[Camera],
     height: usize,
     width: usize,
     count: usize,
@@ -102,23 +103,12 @@ fn median_s(
         renderer.render(views, height, width, count)?;
         seconds.push(now.elapsed().as_secs_f64() / views.len() as f64);
     }
-    Ok(median(&mut seconds))
-}
-
-/// Returns the median of at least one value: the mean of the two middle values for an even count.
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    f64::midpoint(values[(values.len() - 1) / 2], values[values.len() / 2])
+    Ok(median(&seconds))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn median_of_two_times_is_their_mean() {
-        assert_eq!([&mut [3.0, 1.0][..], &mut [5.0, 1.0, 2.0], &mut [7.0]].map(median), [2.0, 2.0, 7.0]);
-    }
 
     #[test]
     fn most_tokens_interpolates_measured_times() {

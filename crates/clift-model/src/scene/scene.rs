@@ -21,11 +21,12 @@
 //! relative to the folder of the file or absolute), `height` and `width` of the context views.
 // S storage tokens, V context views, D width
 
+use clift_core::{Camera, PoseNormalization};
+
 use crate::network::config::ModelConfig;
 use crate::scene::token_format::TokenFormat;
 use crate::tokens::kind::TokenKind;
 use crate::tokens::selection::token_ray::TokenRay;
-use crate::views::camera::ViewCamera;
 
 /// Length of the header of a scene file in bytes.
 pub const HEADER_BYTES: usize = 2048;
@@ -35,15 +36,6 @@ pub(crate) const FORMAT: &str = "clift-scene";
 pub(crate) const VERSION: &str = "2";
 /// The version of files with coded tokens.
 pub(crate) const CODED_VERSION: &str = "5";
-
-/// Normalization of camera positions: `R^T (c - t) * scale`, where `[R | t]` is the mean pose.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SceneNormalization {
-    /// Mean context camera in the world of the capture, camera to world, 4 x 4, row-major.
-    pub mean_c2w: [f64; 16],
-    /// Normalized units per unit of the world of the capture.
-    pub scale: f64,
-}
 
 /// A compressed scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -64,11 +56,11 @@ pub struct Scene {
     /// Width of the context views in pixels.
     pub width: usize,
     /// Normalized context cameras.
-    pub context: Vec<ViewCamera>,
+    pub context: Vec<Camera>,
     /// Frame number of each context view in the capture.
     pub context_frames: Vec<u32>,
-    /// Normalization of the poses.
-    pub world: SceneNormalization,
+    /// Normalization of the poses: its frame has the context cameras.
+    pub world: PoseNormalization,
     /// Patch of each token, `[S]`: `view * rows * columns + row * columns + column`; its index if
     /// tokens are learned, whose files do not store it.
     pub token_ids: Vec<u32>,
@@ -93,11 +85,7 @@ impl Scene {
 
     /// Returns `[moment, direction]` of every token's ray.
     pub(crate) fn plucker_rays(&self) -> Vec<[f64; 6]> {
-        let plucker = |ray: TokenRay| {
-            let ([x, y, z], [a, b, c]) = (ray.origin, ray.direction);
-            [y * c - z * b, z * a - x * c, x * b - y * a, a, b, c]
-        };
-        self.token_rays().into_iter().map(plucker).collect()
+        self.token_rays().iter().map(TokenRay::plucker).collect()
     }
 
     /// Returns the size of the scene's file in bytes.

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use clift_core::Camera;
 
 use crate::cost::memory::render_bytes;
 use crate::error::ModelError;
@@ -16,7 +17,6 @@ use crate::network::tokens::Tokens;
 use crate::scene::scene::Scene;
 use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
-use crate::views::camera::ViewCamera;
 use crate::views::interleave::{interleaved, parts};
 use crate::views::patch_grids::PatchGrids;
 use crate::views::upload::Cameras;
@@ -138,10 +138,10 @@ impl SceneRenderer {
     /// [`ModelError::Device`] if an image cannot be read from the device.
     ///
     /// # Panics
-    /// If a side is no multiple of the patch.
+    /// If a side is not a multiple of the patch.
     pub fn render(
         &mut self,
-        views: &[ViewCamera],
+        views: &[Camera],
         height: usize,
         width: usize,
         num_render_tokens: usize,
@@ -171,7 +171,7 @@ impl SceneRenderer {
 
     fn render_call(
         &self,
-        views: &[ViewCamera],
+        views: &[Camera],
         height: usize,
         width: usize,
         selected: Option<Vec<u32>>,
@@ -229,7 +229,7 @@ mod tests {
         Scene { model: config.clone(), renderer_hash, tokens, token_ids: (0..12).collect(), ..scene() }
     }
 
-    fn path(num_frames: usize) -> Vec<ViewCamera> {
+    fn path(num_frames: usize) -> Vec<Camera> {
         (0..num_frames).map(|i| camera(-0.5 + 0.1 * i as f64, 0.1 - 0.02 * i as f64)).collect()
     }
 
@@ -290,9 +290,10 @@ mod tests {
         let large = scene_renderer.render(&[large], 32, 48, 12).unwrap().remove(0).pixels;
         for (row, column) in [(0, 0), (1, 0), (1, 1)] {
             // Pixel (0, 0) of the large frame is a quarter of a small pixel above and left of the small one's center.
-            let [fx, fy, cx, cy] = small.intrinsics;
             let shift = |phase: usize| 0.25 - 0.5 * phase as f64;
-            let view = ViewCamera { intrinsics: [fx, fy, cx + shift(column), cy + shift(row)], ..small };
+            let mut view = small;
+            view.intrinsics.cx += shift(column);
+            view.intrinsics.cy += shift(row);
             let alone = scene_renderer.render(&[view], 16, 24, 12).unwrap().remove(0).pixels;
             for (i, expected) in alone.as_chunks::<3>().0.iter().enumerate() {
                 let at = 3 * ((2 * (i / 24) + row) * 48 + 2 * (i % 24) + column);

@@ -1,4 +1,4 @@
-//! How a scene file stores its tokens: as plain numbers or coded.
+//! Formats of the tokens of a scene file: plain numbers, or coded.
 
 use std::fmt;
 use std::str::FromStr;

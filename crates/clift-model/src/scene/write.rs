@@ -5,7 +5,8 @@ use std::fs::File;
 use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
-use crate::atomic_files::{folder_of, replace};
+use clift_core::{folder_of, replace_file};
+
 use crate::error::ModelError;
 use crate::scene::header::write_fields;
 use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
@@ -26,9 +27,9 @@ pub fn check_output_path(path: &Path) -> Result<(), ModelError> {
     match std::fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         Err(error) => refuse(&error.to_string(), WRITABLE_FOLDER),
-        Ok(found) if !found.is_file() => refuse("the existing item is no regular file", OTHER_NAME),
+        Ok(found) if !found.is_file() => refuse("the existing item is not a regular file", OTHER_NAME),
         Ok(_) if is_scene(path) => Ok(()),
-        Ok(_) => refuse("the existing file is no scene, and only scenes are overwritten", OTHER_NAME),
+        Ok(_) => refuse("the existing file is not a scene, and only scenes are overwritten", OTHER_NAME),
     }
 }
 
@@ -53,7 +54,7 @@ impl Scene {
     pub fn write(&self, path: &Path, format: TokenFormat) -> Result<(), ModelError> {
         let bytes = self.to_bytes(path, format)?;
         check_output_path(path)?;
-        replace(path, &bytes).map_err(|error| ModelError::SceneFile {
+        replace_file(path, &bytes).map_err(|error| ModelError::SceneFile {
             action: "write",
             reason: error.to_string(),
             fix: WRITABLE_FOLDER,
@@ -76,14 +77,19 @@ impl Scene {
         let u32_bytes = |values: &[u32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
         let rays: Vec<f32> = self.plucker_rays().into_iter().flatten().map(|value| value as f32).collect();
         let mut tensors = vec![
-            ("context_c2w", "F64", vec![views, 4, 4], f64_bytes(&mut self.context.iter().flat_map(|view| view.c2w))),
+            (
+                "context_c2w",
+                "F64",
+                vec![views, 4, 4],
+                f64_bytes(&mut self.context.iter().flat_map(|view| view.c2w.to_matrix_f64())),
+            ),
             (
                 "context_intrinsics",
                 "F64",
                 vec![views, 4],
-                f64_bytes(&mut self.context.iter().flat_map(|view| view.intrinsics)),
+                f64_bytes(&mut self.context.iter().flat_map(|view| view.intrinsics.to_array())),
             ),
-            ("world_mean_c2w", "F64", vec![4, 4], f64_bytes(&mut self.world.mean_c2w.into_iter())),
+            ("world_mean_c2w", "F64", vec![4, 4], f64_bytes(&mut self.world.mean_c2w.to_matrix_f64().into_iter())),
             ("world_scale", "F64", vec![1], f64_bytes(&mut [self.world.scale].into_iter())),
         ];
         let has_places = self.model.has_patch_tokens();

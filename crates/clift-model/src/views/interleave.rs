@@ -1,4 +1,4 @@
-//! Images larger than those of training, interleaved from several of about that size.
+//! Images larger than the training size, interleaved from several images of about the training size.
 //!
 //! A network draws well at the size it was trained on: at twice that size its patches cover half the angle. Every k-th pixel
 //! of every k-th row is an image of the trained size. k x k such images, each with the rays of its pixels, make the large one.

@@ -1,13 +1,11 @@
 //! Images and cameras as tensors: the inputs of the encoder.
 //!
 //! - `upload`: copies images and cameras to a device
-//! - `camera`: a pinhole camera on the host, and its rays
 //! - `rays`: Plücker coordinates of every pixel
 //! - `patch`: images to patch vectors and back
 //! - `interleave`: large images from several of the trained size
 //! - `patch_grids`: images averaged over shifted grids of patches
 
-pub(crate) mod camera;
 pub(crate) mod interleave;
 pub(crate) mod patch;
 pub(crate) mod patch_grids;

@@ -47,10 +47,25 @@ fn cross(a: Tensor<5>, b: Tensor<5>) -> Tensor<5> {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::DType;
+    use burn::tensor::{DType, Device};
+    use clift_core::{Camera, DMat3, DVec3, Intrinsics, Pose};
 
     use super::*;
-    use crate::testing::{Fixture, assert_close, cpu_devices, devices};
+    use crate::testing::{Fixture, assert_close, cpu_devices, devices, to_vec};
+
+    #[test]
+    fn rays_equal_those_of_the_camera_on_the_host() {
+        let c2w = Pose { rotation: DMat3::from_rotation_y(0.3), translation: DVec3::new(0.5, -0.2, 0.1) };
+        let camera = Camera { c2w, intrinsics: Intrinsics { fx: 20.0, fy: 22.0, cx: 8.5, cy: 4.0 } };
+        let rays = to_vec(plucker(&Cameras::of_views(&[camera], 8, 16, &Device::flex()).expect("valid"))); // [1, 1, 8, 16, 6]
+        for (i, ray) in rays.chunks(6).enumerate() {
+            let direction = camera.direction((i % 16) as f64 + 0.5, (i / 16) as f64 + 0.5);
+            let moment = c2w.translation.cross(direction);
+            for (got, expected) in ray.iter().zip(moment.to_array().into_iter().chain(direction.to_array())) {
+                assert!((got - expected).abs() < 1e-6, "pixel {i}: {got} against {expected}"); // f32
+            }
+        }
+    }
 
     #[test]
     fn rays_equal_pytorch_in_f32_and_f64() {

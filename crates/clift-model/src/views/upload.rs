@@ -2,6 +2,7 @@
 // B scenes, V views, H rows, W columns
 
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
+use clift_core::{Camera, ClipViews};
 
 use crate::error::ModelError;
 
@@ -28,25 +29,44 @@ pub struct Views {
 }
 
 impl Cameras {
-    /// Copies cameras to a device.
+    /// Copies the cameras of views to a device, one set of views per scene.
     ///
     /// # Shapes
-    /// - `c2w`: `[batch, views, 4, 4]` row-major, `intrinsics`: `[batch, views, 4]` (`fx, fy, cx, cy` in pixels)
-    /// - `shape`: `[batch, views, height, width]`
+    /// - `scenes`: sets of the same number of views of the same size
+    /// - returns `[batch, views]`
     ///
     /// # Errors
-    /// [`ModelError::WrongLength`] and [`ModelError::NotFinite`].
-    pub fn upload(c2w: &[f32], intrinsics: &[f32], shape: [usize; 4], device: &Device) -> Result<Self, ModelError> {
-        let [batch, views, height, width] = shape;
-        check_length("c2w", c2w.len(), batch * views * 16)?;
-        check_length("intrinsics", intrinsics.len(), batch * views * 4)?;
-        check_finite("c2w", c2w)?;
-        check_finite("intrinsics", intrinsics)?;
+    /// [`ModelError::WrongLength`] if the sets differ in number, [`ModelError::NotFinite`] for a camera.
+    pub fn upload(scenes: &[&ClipViews], device: &Device) -> Result<Self, ModelError> {
+        Self::of_cameras(scenes.iter().flat_map(|views| &views.cameras), shape(scenes), device)
+    }
+
+    /// Copies the cameras of one scene to a device, for images of `height` by `width` pixels.
+    ///
+    /// # Errors
+    /// [`ModelError::NotFinite`] for a camera.
+    pub fn of_views(views: &[Camera], height: usize, width: usize, device: &Device) -> Result<Self, ModelError> {
+        Self::of_cameras(views, [1, views.len(), height, width], device)
+    }
+
+    fn of_cameras<'a>(
+        cameras: impl IntoIterator<Item = &'a Camera>,
+        [batch, views, height, width]: [usize; 4],
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let (mut c2w, mut intrinsics) = (Vec::new(), Vec::new());
+        for camera in cameras {
+            c2w.extend(camera.c2w.to_matrix());
+            intrinsics.extend(camera.intrinsics.to_array().map(|value| value as f32));
+        }
+        check_length("cameras", c2w.len() / 16, batch * views)?;
+        check_finite("c2w", &c2w)?;
+        check_finite("intrinsics", &intrinsics)?;
         Ok(Self {
             height,
             width,
-            c2w: Tensor::from_data(TensorData::new(c2w.to_vec(), [batch, views, 4, 4]), device),
-            intrinsics: Tensor::from_data(TensorData::new(intrinsics.to_vec(), [batch, views, 4]), device),
+            c2w: Tensor::from_data(TensorData::new(c2w, [batch, views, 4, 4]), device),
+            intrinsics: Tensor::from_data(TensorData::new(intrinsics, [batch, views, 4]), device),
         })
     }
 
@@ -58,42 +78,42 @@ impl Cameras {
 }
 
 impl Views {
-    /// Copies 8-bit images and their cameras to a device; pixels are scaled to `[0, 1]`.
+    /// Copies images and cameras to a device, one set of views per scene; pixels are scaled to `[0, 1]`.
     ///
     /// # Shapes
-    /// - `images`: `[batch, views, height, width, 3]`; the others as [`Cameras::upload`]
+    /// - `scenes`: as [`Cameras::upload`]
     ///
     /// # Errors
-    /// [`ModelError::WrongLength`] and [`ModelError::NotFinite`].
-    pub fn upload(
-        images: &[u8],
-        c2w: &[f32],
-        intrinsics: &[f32],
-        shape: [usize; 4],
-        device: &Device,
-    ) -> Result<Self, ModelError> {
-        let cameras = Cameras::upload(c2w, intrinsics, shape, device)?;
-        Ok(Self { images: upload_images(images, shape, device)?, cameras })
+    /// As [`Cameras::upload`] and [`upload_images`].
+    pub fn upload(scenes: &[&ClipViews], device: &Device) -> Result<Self, ModelError> {
+        Ok(Self { images: upload_images(scenes, device)?, cameras: Cameras::upload(scenes, device)? })
     }
 }
 
-/// Copies 8-bit images to a device as RGB in `[0, 1]`, the same bits on every device.
+/// Copies images to a device as RGB in `[0, 1]`, the same bits on every device.
 ///
 /// # Shapes
-/// - `images` and the result: `[batch, views, height, width, 3]`, with `shape` = `[batch, views, height, width]`
+/// - `scenes`: sets of the same number of views of the same size
+/// - returns `[batch, views, height, width, 3]`
 ///
 /// # Errors
 /// [`ModelError::WrongLength`].
-pub fn upload_images(images: &[u8], shape: [usize; 4], device: &Device) -> Result<Tensor<5>, ModelError> {
-    let [batch, views, height, width] = shape;
+pub fn upload_images(scenes: &[&ClipViews], device: &Device) -> Result<Tensor<5>, ModelError> {
+    let [batch, views, height, width] = shape(scenes);
+    let images = scenes.iter().map(|views| &views.images[..]).collect::<Vec<_>>().concat();
     check_length("images", images.len(), batch * views * height * width * 3)?;
     let shape = [batch, views, height, width, 3];
     // Flex computes in the host's memory: nothing has to be moved.
     if *device != Device::flex() {
-        return Ok(upload_packed(images, device).reshape(shape));
+        return Ok(upload_packed(&images, device).reshape(shape));
     }
-    let values: Vec<f32> = images.iter().copied().map(unit).collect();
+    let values: Vec<f32> = images.into_iter().map(unit).collect();
     Ok(Tensor::from_data(TensorData::new(values, shape), device))
+}
+
+/// Returns `[batch, views, height, width]` from the first scene; the uploads check the other scenes.
+fn shape(scenes: &[&ClipViews]) -> [usize; 4] {
+    scenes.first().map_or([0; 4], |first| [scenes.len(), first.num_views(), first.height, first.width])
 }
 
 fn unit(value: u8) -> f32 {
@@ -129,8 +149,22 @@ fn check_finite(name: &'static str, values: &[f32]) -> Result<(), ModelError> {
 
 #[cfg(test)]
 mod tests {
+    use clift_core::{Intrinsics, Pose};
+
     use super::*;
     use crate::testing::devices;
+
+    /// Returns views of 19 x 1 pixels.
+    fn views(count: usize, images: &[u8]) -> ClipViews {
+        let intrinsics = Intrinsics { fx: 19.0, fy: 19.0, cx: 9.5, cy: 0.5 };
+        ClipViews {
+            width: 19,
+            height: 1,
+            images: images.to_vec(),
+            cameras: vec![Camera { c2w: Pose::IDENTITY, intrinsics }; count],
+            frame_index: (0..count).collect(),
+        }
+    }
 
     #[test]
     fn pixels_have_the_same_bits_on_every_device() {
@@ -139,7 +173,7 @@ mod tests {
         let expected: Vec<u32> = bytes.iter().map(|&byte| (f32::from(byte) / 255.0).to_bits()).collect();
         for device in devices() {
             let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
-            let images = upload_images(&bytes, [1, 5, 1, 19], &device).expect("285 values");
+            let images = upload_images(&[&views(5, &bytes)], &device).expect("285 values");
             assert_eq!(bits(images.try_into_vec_as().expect("f32")), expected, "{device:?}");
             let packed = upload_packed(&bytes, &device.clone().autodiff());
             assert_eq!(bits(packed.inner().try_into_vec_as().expect("f32")), expected, "{device:?}");
@@ -149,12 +183,12 @@ mod tests {
     #[test]
     fn wrong_lengths_and_nan_are_refused() {
         let device = Device::flex();
-        let error = Cameras::upload(&[0.0; 15], &[0.0; 4], [1, 1, 8, 8], &device).unwrap_err();
-        assert_eq!(error.to_string(), "c2w: expected 16 values for the shape, got 15");
-        let mut pose = [0.0; 16];
-        pose[3] = f32::NAN;
-        let error = Cameras::upload(&pose, &[0.0; 4], [1, 1, 8, 8], &device).unwrap_err();
+        let error = Cameras::upload(&[&views(2, &[]), &views(1, &[])], &device).unwrap_err();
+        assert_eq!(error.to_string(), "cameras: expected 4 values for the shape, got 3");
+        let mut broken = views(1, &[0; 57]);
+        broken.cameras[0].c2w.translation.x = f64::NAN;
+        let error = Views::upload(&[&broken], &device).unwrap_err();
         assert_eq!(error.to_string(), "c2w holds NaN at position 3");
-        assert!(Views::upload(&[0; 191], &[0.0; 16], &[0.0; 4], [1, 1, 8, 8], &device).is_err());
+        assert!(Views::upload(&[&views(1, &[0; 56])], &device).is_err());
     }
 }

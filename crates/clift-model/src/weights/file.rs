@@ -12,8 +12,8 @@ use burn::store::{
     PyTorchToBurnAdapter, SafetensorsStore,
 };
 use burn::tensor::{DType, TensorData};
+use clift_core::{TEMPORARY, folder_of, publish_file};
 
-use crate::atomic_files::{TEMPORARY, folder_of, publish};
 use crate::error::ModelError;
 use crate::weights::hash::visit;
 
@@ -103,7 +103,7 @@ fn write<M: Module>(
         .metadata("format", "clift-1");
     module.save_into(&mut store).map_err(|e| error(e.to_string()))?;
     let sorted = File::options().read(true).write(true).open(&temporary).and_then(|mut file| sort_header(&mut file));
-    sorted.and_then(|()| publish(&temporary, path)).map_err(|e| error(e.to_string()))
+    sorted.and_then(|()| publish_file(&temporary, path)).map_err(|e| error(e.to_string()))
 }
 
 /// Rewrites a safetensors header with sorted keys, which Burn's store writes in random order. The bytes of the tensors stay
@@ -127,7 +127,7 @@ fn sort_header(file: &mut (impl Read + Write + Seek)) -> std::io::Result<()> {
 /// Sorts the keys of the header of a safetensors file in memory.
 ///
 /// # Errors
-/// For bytes that are no safetensors file.
+/// For bytes that are not a safetensors file.
 pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
     sort_header(&mut Cursor::new(&mut bytes[..]))?;
     Ok(bytes)
@@ -319,7 +319,7 @@ mod tests {
         let path = folder.path().join("model.safetensors");
         assert!(load(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
         save_weights(&model(1).encoder, &path).expect("writes");
-        let loaded = load(&mut model(2), &path).expect("a file without a matching name is no error");
+        let loaded = load(&mut model(2), &path).expect("a file without a matching name is not an error");
         let message = loaded.require_all(&path).unwrap_err().to_string();
         assert!(message.contains(" missing parameters (condenser.blocks.0"), "{message}");
         let missing = loaded.missing;

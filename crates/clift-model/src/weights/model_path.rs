@@ -49,7 +49,7 @@ impl ModelPath {
     }
 
     /// Returns the weight file that renders tokens of a kind: that of stage 1 or 2 of a run directory, that of a model
-    /// directory, or `path` itself if `path` is no directory. The file need not exist.
+    /// directory, or `path` itself if `path` is not a directory. The file need not exist.
     pub fn for_tokens(path: &Path, kind: TokenKind) -> PathBuf {
         let inside = path.join(WEIGHTS);
         match (path.is_dir(), inside.is_file()) {

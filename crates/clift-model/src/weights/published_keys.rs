@@ -10,7 +10,7 @@ use crate::network::layers::Part;
 
 /// Prefix of the network's keys in a checkpoint of the published training program.
 pub const PREFIX: &str = "transformer.";
-/// Prefix of the keys of the perceptual loss, which is no part of the network.
+/// Prefix of the keys of the perceptual loss, which is not part of the network.
 pub const PERCEPTUAL_PREFIX: &str = "perceptual_loss.";
 
 /// Layers that are 1 x 1 convolutions in the published module, `[outputs, inputs, 1, 1]`; linear layers are read too.

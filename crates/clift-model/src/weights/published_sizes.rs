@@ -58,7 +58,7 @@ fn probe(variant: CliftVariant) -> ModelConfig {
     }
 }
 
-/// Infers the sizes of a network from keys without prefix and their shapes, which are empty for values that are no tensors.
+/// Infers the sizes of a network from keys without prefix and their shapes, which are empty for values that are not tensors.
 ///
 /// Shapes determine the number of heads only in the variant with norms of heads; `num_heads` gives it for the others.
 pub fn infer_config<'a>(

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
-use clift_data::{make_folder, publish_folder, remove_folder};
+use clift_core::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, first_not_f32};
 
 use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};
@@ -265,9 +265,9 @@ fn apply(
     }
     train_state.optimizer = loaded;
     if loss_scale.is_some_and(|scale| !scale.is_possible()) {
-        return Err(bad(STATE, "the loss scale is no power of two from 1 to 2^32".into()));
+        return Err(bad(STATE, "the loss scale is not a power of two from 1 to 2^32".into()));
     }
-    // The precision is that of the config.
+    // The config sets the precision.
     if train_state.loss_scale.is_some() && loss_scale.is_some() {
         train_state.loss_scale = loss_scale;
     }

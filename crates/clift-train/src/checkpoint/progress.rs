@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-use clift_data::replace_file;
+use clift_core::replace_file;
 use clift_model::ModelConfig;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;

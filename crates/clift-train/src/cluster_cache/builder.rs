@@ -7,9 +7,9 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, DataError, ViewIndices, derive_seed, item_rng, uniform_below};
-use clift_eval::upload_views;
-use clift_model::{Encoder, SceneClusters};
+use clift_core::{derive_seed, item_rng, uniform_below};
+use clift_data::{ClipReader, DataError, ViewIndices};
+use clift_model::{Encoder, SceneClusters, Views};
 
 use crate::cluster_cache::cache::{CacheSettings, ClusterCache, VERSION};
 use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
@@ -109,7 +109,7 @@ impl ClusterBuilder<'_> {
         let count = grid[uniform_below(&mut rng, grid.len())].of(num_tokens)?;
         let patches = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
         // Tokens before the token norm, as in the released code: stage 2 trains this norm.
-        let context_views = upload_views(&[&clip.context], device)?;
+        let context_views = Views::upload(&[&clip.context], device)?;
         let tokens = || encoder.forward(&context_views).values;
         let kmeans = (kmeans, derive_seed(seed, &clip.key));
         Ok((context, grouping.group(count, (num_context, patches), kmeans, tokens)?))

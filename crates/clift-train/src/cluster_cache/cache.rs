@@ -7,9 +7,8 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use clift_data::{
-    Crop, FileOptions, PoseRotation, PoseScale, SceneFilters, SkipReport, SourceKind, SyntheticConfig, ViewSampler,
-};
+use clift_core::{PoseRotation, PoseScale};
+use clift_data::{Crop, FileOptions, SceneFilters, SkipReport, SourceKind, SyntheticConfig, ViewSampler};
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

@@ -8,7 +8,8 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use clift_data::{SkipReport, make_folder, publish_folder, replace_file};
+use clift_core::{make_folder, publish_folder, replace_file};
+use clift_data::SkipReport;
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
@@ -216,7 +217,7 @@ fn encode_clusters(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::item_rng;
+    use clift_core::item_rng;
     use rand::RngExt;
 
     use super::*;

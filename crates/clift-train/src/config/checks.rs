@@ -1,6 +1,7 @@
 //! Checks of a config beyond its types: ranges, and values that depend on each other.
 
-use clift_data::{BadConfig, DataConfig, SourceKind, Split, check_config};
+use clift_core::{BadConfig, check_config};
+use clift_data::{DataConfig, SourceKind, Split};
 use clift_eval::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 

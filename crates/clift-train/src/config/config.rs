@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{DataConfig, derive_seed};
+use clift_core::derive_seed;
+use clift_data::DataConfig;
 use clift_eval::{EvalConfig, PERCEPTUAL_COMMAND, Sweep};
 use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCount};
 use serde::{Deserialize, Serialize};

@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use clift_data::{BadConfig, DataError};
+use clift_core::BadConfig;
+use clift_data::DataError;
 use clift_model::ModelError;
 use codespan_reporting::diagnostic::Diagnostic;
 use serde::Serialize;

@@ -36,7 +36,7 @@ pub enum ConfigError {
 /// Reads the TOML file at `path`, applies the overrides in order, and returns the config with the changed keys.
 ///
 /// An override is `key=TOML` with a dotted key: `stage1.steps=100`, `clusters.grid=[0.5, 1.0]`. A word of
-/// letters, digits and `-_./\:~+@%` that is no TOML value is a string: `device=wgpu` and `data.root=/data/re10k` need no
+/// letters, digits and `-_./\:~+@%` that is not a TOML value is a string: `device=wgpu` and `data.root=/data/re10k` need no
 /// inner quotes.
 ///
 /// # Errors

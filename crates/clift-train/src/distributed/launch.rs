@@ -85,6 +85,10 @@ mod tests {
         assert_eq!(launched(&step), [1, 2]);
         let mpirun = [("OMPI_COMM_WORLD_SIZE", "8"), ("OMPI_COMM_WORLD_RANK", "5")];
         assert_eq!(launched(&[step, mpirun].concat()), [5, 8], "mpirun inside a job step");
-        assert_eq!(launched(&[("SLURM_PROCID", "0"), ("SLURM_NTASKS", "4")]), [0, 1], "a batch script is no job step");
+        assert_eq!(
+            launched(&[("SLURM_PROCID", "0"), ("SLURM_NTASKS", "4")]),
+            [0, 1],
+            "a batch script is not a job step"
+        );
     }
 }

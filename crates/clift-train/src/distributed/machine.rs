@@ -9,12 +9,12 @@ use clift_model::DeviceName;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 
-/// What a rank shares with the other ranks of its host.
+/// Resources that a rank shares with the other ranks of its host.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RankPlace {
     /// Name of the host.
     pub host: String,
-    /// Number of this rank among those of the host, from 0.
+    /// Number of this rank on its host, from 0.
     pub local_rank: usize,
     /// Number of ranks on the host.
     pub num_local: usize,

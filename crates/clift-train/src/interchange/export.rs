@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use burn::store::PathFilter;
-use clift_data::{replace_file, write_state_dict};
+use clift_core::replace_file;
+use clift_data::write_state_dict;
 use clift_model::{
     CameraEncoding, Clift, DeviceName, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TokenCodec, TrainedModel,
     published_tensors, save_part_f16,
@@ -113,7 +114,7 @@ fn export_published(
         tensors.push((format!("{PREFIX}{}", tensor.key), shape, values));
     }
     if let Some(path) = ours.keys().next() {
-        return Err(bad(format!("{path} is no parameter of a {} network", config.model.variant)));
+        return Err(bad(format!("{path} is not a parameter of a {} network", config.model.variant)));
     }
     let exported = Exported {
         num_tensors: tensors.len(),

@@ -4,7 +4,8 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_folder, replace_file};
+use clift_core::{PoseRotation, PoseScale, TEMPORARY, folder_of, publish_folder, replace_file};
+use clift_data::SourceKind;
 use clift_model::{CliftVariant, ModelConfig, ModelPath, TokenCodec, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
 
@@ -86,7 +87,7 @@ pub(crate) fn publish_model_dir<T>(
     if folder.file_name().is_none() {
         return Err(bad("-o", folder.display(), "write the name of a directory"));
     }
-    let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let above = folder_of(folder);
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
     #[cfg(unix)]

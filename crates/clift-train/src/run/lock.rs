@@ -4,7 +4,7 @@ use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::Path;
 
-use clift_data::TEMPORARY;
+use clift_core::TEMPORARY;
 
 use crate::error::TrainError;
 use crate::events::{Event, Sink};

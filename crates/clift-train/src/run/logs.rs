@@ -100,7 +100,7 @@ fn truncate_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
             Err(_) => (is_whole, broken) = (false, Some(number)),
         }
     }
-    if is_whole { Ok(()) } else { clift_data::replace_file(path, &kept) }
+    if is_whole { Ok(()) } else { clift_core::replace_file(path, &kept) }
 }
 
 /// A line of `skipped.jsonl`: a scene that could not be used, at its first step.

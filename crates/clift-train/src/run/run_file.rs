@@ -1,9 +1,9 @@
-//! `run.json`, and the comparison of a config with that of an existing run.
+//! `run.json`, and the comparison of a config with the config of an existing run.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clift_data::{StagedDir, make_folder, remove_leftovers, replace_file};
+use clift_core::{StagedDir, make_folder, remove_leftovers, replace_file};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -73,7 +73,7 @@ pub struct RunOptions {
     pub overfit: Option<usize>,
     /// Start a new run; the existing run directory is renamed.
     pub fresh: bool,
-    /// Allow larger step counts than those of the existing run.
+    /// Allow larger step counts than the existing run has.
     pub extend: bool,
 }
 
@@ -147,7 +147,7 @@ fn write_config(config: &Config, folder: &Path) -> Result<(), TrainError> {
     replace_file(&path, text.as_bytes()).map_err(TrainError::io("writing the config", &path))
 }
 
-/// Compares a config with that of the run in `folder`. Returns the larger step counts that `extend` allows.
+/// Compares a config with the config of the run in `folder`. Returns the larger step counts that `extend` allows.
 ///
 /// # Errors
 /// [`TrainError::OtherRun`] for any other difference in keys that affect the result.

@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use burn::module::Module;
-use clift_data::{make_folder, plural};
+use clift_core::make_folder;
+use clift_data::plural;
 use clift_eval::{peak_bytes, psnr_of_mse};
 use clift_model::{Clift, weights_hash};
 
@@ -183,7 +184,7 @@ impl<'a> TrainLoop<'a> {
         self.progress.step = step;
         self.report(update, lr, started);
         if train_state.adapt_loss_scale(&update) {
-            // An overflow is no anomaly of the batch.
+            // An overflow is not an anomaly of the batch.
             let factor = train_state.loss_scale.map_or(1.0, |scale| scale.factor());
             let text = format!("skipped step {step}: a gradient overflowed in f16; the loss scale is now {factor}");
             self.log.event(&Event::Message(text));

@@ -21,7 +21,7 @@ use crate::footprint::largest_tensor;
 use crate::run::eval_folder::EvalFolder;
 use crate::run::training_curves::training_curves;
 
-/// What an evaluation measures, and where its results are written.
+/// Settings of an evaluation: methods, counts, and the output folder.
 #[derive(Clone, Copy, Debug)]
 pub struct EvalRequest<'a> {
     /// The split of the data set.

@@ -53,7 +53,7 @@ impl StageSettings<'_> {
         step <= self.half_resolution_steps
     }
 
-    /// Returns the last step whose images have the size of those of `step`, counted from 1.
+    /// Returns the last step with the image size of `step`, counted from 1.
     pub fn last_step_of_size(&self, step: u64) -> u64 {
         if self.is_half_resolution(step) { self.half_resolution_steps } else { self.steps }
     }

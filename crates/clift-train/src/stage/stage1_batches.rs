@@ -2,9 +2,8 @@
 
 use std::sync::Arc;
 
-use clift_data::{
-    ClipReader, ClipViews, ReadClip, TrainingClips, derive_seed, half_resolution_clips, item_rng, step_rng,
-};
+use clift_core::{ClipViews, derive_seed, item_rng, step_rng};
+use clift_data::{ClipReader, ReadClip, TrainingClips, half_resolution_clips};
 use rand::RngExt;
 use rand::seq::index::sample;
 

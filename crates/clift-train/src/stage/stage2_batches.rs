@@ -3,10 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use clift_data::{
-    Clip, ClipReader, NoUsableScene, SkippedScene, SlotFiller, ViewIndices, derive_seed, item_rng, sample_targets,
-    step_rng, uniform_below,
-};
+use clift_core::{derive_seed, item_rng, step_rng, uniform_below};
+use clift_data::{Clip, ClipReader, NoUsableScene, SkippedScene, SlotFiller, ViewIndices, sample_targets};
 use clift_model::SceneClusters;
 
 use crate::cluster_cache::cache::{CacheEntry, ClusterCache};

@@ -3,8 +3,7 @@
 
 use burn::tensor::{Device, Tensor};
 use clift_data::Clip;
-use clift_eval::{upload_cameras, upload_images, upload_views};
-use clift_model::{Cameras, Clift, Pass, TokenStep, Views};
+use clift_model::{Cameras, Clift, Pass, TokenStep, Views, upload_images};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -24,13 +23,13 @@ impl DeviceBatch {
     /// Copies the views of clips to a device.
     ///
     /// # Errors
-    /// Those of [`upload_views`] for views of different sizes.
+    /// Those of [`Views::upload`] for views of different sizes.
     pub fn upload(clips: &[Clip], device: &Device) -> Result<Self, TrainError> {
         let contexts: Vec<_> = clips.iter().map(|clip| &clip.context).collect();
         let targets: Vec<_> = clips.iter().map(|clip| &clip.target).collect();
         Ok(Self {
-            context: upload_views(&contexts, device)?,
-            targets: upload_cameras(&targets, device)?,
+            context: Views::upload(&contexts, device)?,
+            targets: Cameras::upload(&targets, device)?,
             target_images: upload_images(&targets, device)?,
         })
     }

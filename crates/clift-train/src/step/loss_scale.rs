@@ -4,7 +4,7 @@
 use clift_model::Precision;
 use serde::{Deserialize, Serialize};
 
-/// Initial factor, that of PyTorch's `GradScaler`.
+/// Initial factor, as in PyTorch's `GradScaler`.
 const FIRST: f64 = 65_536.0;
 /// Updates without overflow before the factor is doubled, as in PyTorch.
 const PATIENCE: u32 = 2000;

@@ -2,7 +2,8 @@
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
-use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose, item_rng, step_rng, uniform_below};
+use clift_core::{Camera, ClipViews, DMat3, DVec3, Intrinsics, Pose, item_rng, step_rng, uniform_below};
+use clift_data::Clip;
 use clift_model::{Clift, ModelConfig, SceneClusters};
 use rand::{Rng, RngExt};
 
@@ -53,8 +54,7 @@ fn views(positions: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -
         width,
         height,
         images,
-        c2w: positions.into_iter().map(pose).collect(),
-        intrinsics: vec![intrinsics; num_views],
+        cameras: positions.into_iter().map(|position| Camera { c2w: pose(position), intrinsics }).collect(),
         frame_index: (0..num_views).collect(),
     }
 }
@@ -150,8 +150,8 @@ mod tests {
         let clip = seeded_clip(shape, 5, 1);
         assert_eq!((clip.context.num_views(), clip.target.num_views()), (3, 2));
         assert_eq!(clip.context.images.len(), 3 * 8 * 16 * 3);
-        assert!(clip.context.c2w.iter().all(|pose| pose.orthonormality_defect() < 1e-12));
-        assert!(clip.context.c2w.windows(2).all(|pair| pair[0] != pair[1]), "views differ");
+        assert!(clip.context.cameras.iter().all(|camera| camera.c2w.orthonormality_defect() < 1e-12));
+        assert!(clip.context.cameras.windows(2).all(|pair| pair[0] != pair[1]), "views differ");
         assert_eq!(clip, seeded_clip(shape, 5, 1));
         assert_ne!(clip.context.images, seeded_clip(shape, 6, 1).context.images);
     }

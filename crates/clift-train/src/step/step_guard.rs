@@ -2,7 +2,8 @@
 
 use std::collections::VecDeque;
 
-use clift_data::{Clip, SkippedScene, median};
+use clift_core::median;
+use clift_data::{Clip, SkippedScene};
 use serde::{Deserialize, Serialize};
 
 use crate::config::config::OptimizerConfig;

@@ -49,7 +49,7 @@ pub struct OpenedScene<'a> {
     pub context: Vec<SceneCamera>,
     /// Whether the parts are the true context images; a scene file holds no images, its contexts are rendered.
     pub has_true_images: bool,
-    /// Frames with a true image that are no contexts.
+    /// Frames with a true image that are not context views.
     pub frames: Vec<SceneCamera>,
     /// Distance of the point that the contexts look at, from the origin along +z.
     pub focus: f64,

@@ -1,7 +1,7 @@
 //! Messages of the page: JSON text, checked before they reach the render thread.
 
-use clift_data::{Intrinsics, IntrinsicsNorm, MAX_COORDINATE, Pose};
-use clift_model::{Precision, SelectionPreset, ViewCamera};
+use clift_core::{Camera, IntrinsicsNorm, MAX_COORDINATE, Pose};
+use clift_model::{Precision, SelectionPreset};
 use serde::de::{Deserialize, Deserializer, Error};
 
 /// Largest accepted message in bytes. The page's largest has about 700.
@@ -75,9 +75,8 @@ pub struct CompareRequest {
 
 impl ViewRequest {
     /// Returns the camera for an image of `width` by `height` pixels.
-    pub fn camera(&self, [width, height]: [usize; 2]) -> ViewCamera {
-        let Intrinsics { fx, fy, cx, cy } = self.intrinsics.to_pixels(width, height);
-        ViewCamera { c2w: self.c2w.to_matrix_f64(), intrinsics: [fx, fy, cx, cy] }
+    pub fn camera(&self, [width, height]: [usize; 2]) -> Camera {
+        Camera { c2w: self.c2w, intrinsics: self.intrinsics.to_pixels(width, height) }
     }
 }
 
@@ -116,8 +115,8 @@ mod tests {
     fn views_have_cameras_in_pixels() {
         let Request::View(request) = serde_json::from_value(view()).unwrap() else { panic!("a view") };
         let camera = request.camera([32, 24]);
-        assert_eq!(camera.origin(), [0.5, 0.0, -2.0]);
-        for (got, expected) in camera.intrinsics.into_iter().zip([32.0, 28.8, 16.0, 12.0]) {
+        assert_eq!(camera.c2w.translation.to_array(), [0.5, 0.0, -2.0]);
+        for (got, expected) in camera.intrinsics.to_array().into_iter().zip([32.0, 28.8, 16.0, 12.0]) {
             assert!((got - expected).abs() < 1e-12, "{got} is not {expected}");
         }
     }

@@ -1,9 +1,9 @@
 //! A scene ready to render, with all that the page shows of it.
 
 use burn::tensor::Device;
-use clift_data::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
+use clift_core::{Camera, Intrinsics, IntrinsicsNorm, RgbImage, focus_distance, mean_intrinsics};
 use clift_eval::{Canvas, available_bytes};
-use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, ViewCamera, frame_bytes};
+use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, frame_bytes};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};
@@ -69,14 +69,10 @@ impl OpenScene {
         let Self { scene, origin, sizes, .. } = self;
         let images: Vec<Vec<u8>> = self.context_images.iter().map(png).collect::<Result<_, _>>()?;
         let size = [scene.width, scene.height];
-        let context: Vec<PathView> = scene.context.iter().map(path_view).collect::<Result<_, _>>()?;
         // The intrinsics of a frame are known when its image is read; until then, the mean of the contexts.
-        let mean = mean_intrinsics(&context).unwrap_or(Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 });
-        let of_frame = |frame: &TrueFrame| {
-            let camera =
-                ViewCamera { c2w: frame.c2w.to_matrix_f64(), intrinsics: [mean.fx, mean.fy, mean.cx, mean.cy] };
-            scene_camera(frame.frame, &camera, size)
-        };
+        let mean = mean_intrinsics(&scene.context).unwrap_or(Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 });
+        let of_frame =
+            |frame: &TrueFrame| scene_camera(frame.frame, &Camera { c2w: frame.c2w, intrinsics: mean }, size);
         let context_frames = scene.context.iter().zip(&scene.context_frames);
         let reply = OpenedScene {
             scene: origin.index,
@@ -95,8 +91,8 @@ impl OpenScene {
             context: context_frames.map(|(camera, &frame)| scene_camera(frame as usize, camera, size)).collect(),
             has_true_images,
             frames: origin.frames.iter().map(of_frame).collect(),
-            focus: focus_distance(&context),
-            mean_c2w: scene.world.mean_c2w,
+            focus: focus_distance(&scene.context),
+            mean_c2w: scene.world.mean_c2w.to_matrix_f64(),
             scale: scene.world.scale,
             encode_command: origin.encode_command.clone(),
             render_command: origin.render_command.clone(),
@@ -106,24 +102,18 @@ impl OpenScene {
 }
 
 /// Returns a camera for the page, of an image of `[width, height]` pixels.
-pub fn scene_camera(frame: usize, camera: &ViewCamera, [width, height]: [usize; 2]) -> SceneCamera {
-    let (width, height) = (width as f64, height as f64);
-    let [fx, fy, cx, cy] = camera.intrinsics;
+pub fn scene_camera(frame: usize, camera: &Camera, [width, height]: [usize; 2]) -> SceneCamera {
     let mut c2w = [0.0; 12];
-    c2w.copy_from_slice(&camera.c2w[..12]);
-    SceneCamera { frame, c2w, intrinsics: [fx / width, fy / height, cx / width, cy / height] }
+    c2w.copy_from_slice(&camera.c2w.to_matrix_f64()[..12]);
+    let intrinsics = IntrinsicsNorm::from_pixels(camera.intrinsics, width as f64, height as f64);
+    SceneCamera { frame, c2w, intrinsics: intrinsics.to_array() }
 }
 
 /// Encodes an image as PNG.
 pub fn png(image: &Canvas) -> Result<Vec<u8>, ViewError> {
     let rgb = image.as_rgb8().to_vec();
-    let image = clift_data::RgbImage { width: image.width(), height: image.height(), rgb };
+    let image = RgbImage { width: image.width(), height: image.height(), rgb };
     Ok(clift_data::encode_png(&image)?)
-}
-
-fn path_view(camera: &ViewCamera) -> Result<PathView, ViewError> {
-    let [fx, fy, cx, cy] = camera.intrinsics;
-    Ok(PathView { c2w: Pose::from_matrix(&camera.c2w)?, intrinsics: Intrinsics { fx, fy, cx, cy } })
 }
 
 /// Returns the sizes of whole patches that fit into half of the memory.

@@ -24,7 +24,7 @@ pub enum SceneSet {
 pub struct SceneFile {
     /// The scene.
     pub scene: Scene,
-    /// How the file stores the tokens.
+    /// Format of the stored tokens.
     pub coding: TokenCoding,
     /// Bytes of the file.
     pub file_bytes: u64,

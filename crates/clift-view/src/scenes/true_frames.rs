@@ -1,8 +1,9 @@
-//! Frames of a run's scene that have a true image and are no contexts.
+//! Frames of a run's scene that have a true image and are not context views.
 
-use clift_data::{ClipReader, ClipViews, Pose, PoseNormalization, ViewIndices};
-use clift_eval::{Canvas, view_cameras};
-use clift_model::{Scene, ViewCamera};
+use clift_core::{Camera, ClipViews, Pose};
+use clift_data::{ClipReader, ViewIndices};
+use clift_eval::Canvas;
+use clift_model::Scene;
 
 use crate::error::ViewError;
 
@@ -20,17 +21,16 @@ pub struct TrueFrame {
 #[derive(Clone, Debug)]
 pub struct TrueImage {
     pub image: Canvas,
-    pub camera: ViewCamera,
+    pub camera: Camera,
 }
 
-/// Lists the frames that are no contexts.
+/// Lists the frames that are not context views.
 pub fn list(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Vec<TrueFrame>, ViewError> {
     let cameras = reader.source.cameras(index)?;
-    let normalization = normalization(scene)?;
     let is_context = |frame: usize| scene.context_frames.contains(&(frame as u32));
     let others = cameras.iter().enumerate().filter(|(frame, _)| !is_context(*frame));
     let frames: Vec<TrueFrame> =
-        others.map(|(frame, camera)| TrueFrame { frame, c2w: normalization.normalize(camera.c2w) }).collect();
+        others.map(|(frame, camera)| TrueFrame { frame, c2w: scene.world.normalize(camera.c2w) }).collect();
     Ok(frames.iter().step_by(frames.len().div_ceil(MAX_FRAMES).max(1)).copied().collect())
 }
 
@@ -39,9 +39,8 @@ pub fn read(reader: &ClipReader, index: usize, scene: &Scene, frame: TrueFrame) 
     let context = scene.context_frames.iter().map(|&frame| frame as usize).collect();
     let mut target = reader.read(index, &ViewIndices { context, target: vec![frame.frame] })?.target;
     // The pose of the scene file: `reader` may normalize by the target too.
-    target.c2w = vec![frame.c2w];
-    let camera = view_cameras(&target)[0];
-    Ok(TrueImage { image: images(&target)?.remove(0), camera })
+    target.cameras[0].c2w = frame.c2w;
+    Ok(TrueImage { image: images(&target)?.remove(0), camera: target.cameras[0] })
 }
 
 /// Reads the context images.
@@ -53,8 +52,4 @@ pub fn read_context(reader: &ClipReader, index: usize, scene: &Scene) -> Result<
 fn images(views: &ClipViews) -> Result<Vec<Canvas>, ViewError> {
     let images = views.images.chunks_exact(views.height * views.width * 3);
     images.map(|rgb| Ok(Canvas::from_rgb8(rgb, views.height, views.width)?)).collect()
-}
-
-fn normalization(scene: &Scene) -> Result<PoseNormalization, ViewError> {
-    Ok(PoseNormalization { mean_c2w: Pose::from_matrix(&scene.world.mean_c2w)?, scale: scene.world.scale })
 }

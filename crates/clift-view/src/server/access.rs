@@ -11,7 +11,7 @@ use axum::http::{HeaderMap, Uri, header};
 /// Why a request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// Host that is no address of this machine.
+    /// Host that is not an address of this machine.
     Host,
     /// WebSocket from another origin.
     Origin,

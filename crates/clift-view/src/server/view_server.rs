@@ -43,7 +43,7 @@ pub struct ViewServer {
     access: Access,
 }
 
-/// What every request needs.
+/// State shared by all requests.
 struct Shared {
     access: Access,
     clients: Arc<Clients>,
@@ -133,7 +133,7 @@ fn serve(listener: TcpListener, shared: Arc<Shared>) -> std::io::Result<()> {
                 let mut http = http1::Builder::new();
                 http.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT).max_buf_size(MAX_HEAD_BYTES);
                 let connection = http.serve_connection(TokioIo::new(stream), service).with_upgrades();
-                // A connection that breaks is no error of the server.
+                // A connection that breaks is not an error of the server.
                 drop(connection.await);
                 drop(permit);
             });

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_data::{RgbImage, encode_jpeg, encode_png};
+use clift_core::RgbImage;
+use clift_data::{encode_jpeg, encode_png};
 use clift_eval::{Canvas, psnr};
 use clift_model::{DeviceName, PatchGrids, SceneRenderer, SelectionPreset};
 
@@ -154,7 +155,7 @@ impl RenderLoop {
             frame: request.frame,
             camera: scene_camera(scene.origin.frames[request.frame].frame, &image.camera, [width, height]),
             tokens,
-            // Infinity is no JSON.
+            // JSON cannot represent infinity.
             psnr: psnr(&view.pixels, &target)?.min(100.0),
         };
         let true_png = if request.image { vec![png(&image.image)?] } else { Vec::new() };

@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_core::DVec3;
 use clift_data::{ClipReader, SceneSource, Split, plural};
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
 use clift_model::{
     CodedLoss, ModelError, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TokenKind, TrainedModel,
-    ViewCamera, check_output_path,
+    check_output_path,
 };
 use serde::Serialize;
 
@@ -166,9 +167,8 @@ const MAX_TURN_DEG: f64 = 140.0;
 
 /// Warns of context views that look at a place from opposite sides.
 fn warn_of_turn(scene: &Scene) {
-    let axes: Vec<[f64; 3]> = scene.context.iter().map(ViewCamera::axis).collect();
-    let cosine = |a: &[f64; 3], b: &[f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let least = axes.iter().flat_map(|a| axes.iter().map(|b| cosine(a, b))).fold(1.0, f64::min);
+    let axes: Vec<DVec3> = scene.context.iter().map(|camera| camera.c2w.rotation.z_axis).collect();
+    let least = axes.iter().flat_map(|a| axes.iter().map(|b| a.dot(*b))).fold(1.0, f64::min);
     let widest = least.max(-1.0).acos().to_degrees();
     if widest > MAX_TURN_DEG {
         print_warning(format!(
@@ -185,7 +185,7 @@ fn cropped(image: [usize; 2], network: [usize; 2]) -> Option<[usize; 2]> {
     (0..2).any(|side| kept[side] * 10 < image[side] * 9).then_some(kept)
 }
 
-/// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
+/// Prints how a frame that is not a context view is rendered, with a warning if a copy of a context view is nearer to it.
 fn print_check(check: Option<HeldOutFrame>, model: &Path, names: &[String]) -> anyhow::Result<()> {
     let Some(HeldOutFrame { frame, psnr, nearest_psnr }) = check else {
         return print_result("check: no frame beside the contexts to compare a rendering with");

@@ -181,7 +181,7 @@ fn text(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// Opens the user's browser where there is a screen. A failure is no error: the URL is printed.
+/// Opens the user's browser where there is a screen. A failure is not an error: the URL is printed.
 fn open_browser(url: &str) {
     let has_screen = ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some());
     let (program, args): (&str, &[&str]) = if cfg!(target_os = "macos") {

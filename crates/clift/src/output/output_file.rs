@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::replace_file;
+use clift_core::replace_file;
 use serde::Serialize;
 
 use crate::exit_code::usage_bail;

@@ -10,7 +10,7 @@ use clift_eval::Summary;
 use crate::output::verbosity::Verbosity;
 use crate::output::visible::visible;
 
-/// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is no error.
+/// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is not an error.
 pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }

@@ -55,9 +55,9 @@ pub(crate) type RunCase = fn(&CaseDevices) -> Result<Outcome, TrainError>;
 /// One hard case.
 #[derive(Clone, Copy, Debug)]
 pub struct StabilityCase {
-    /// What is extreme about the input.
+    /// Extreme property of the input.
     pub name: &'static str,
-    /// What could break.
+    /// Computation at risk.
     pub breaks: &'static str,
     /// The required result.
     pub bound: Bound,

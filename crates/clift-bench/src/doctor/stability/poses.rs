@@ -1,6 +1,7 @@
 //! Pose normalization of scenes whose cameras are far away or close together.
 
-use clift_data::{Pose, PoseNormalization, PoseRotation, PoseScale};
+use clift_core::{Camera, CameraError, Pose, PoseNormalization, PoseRotation, PoseScale};
+use clift_data::DataError;
 use clift_train::{ClipShape, TrainError, seeded_clip};
 
 use crate::cases::reference::largest_magnitude;
@@ -49,21 +50,21 @@ pub(crate) const CASES: &[StabilityCase] = &[
 fn normalization_error(distance: f64, baseline: f64, in_f32: bool) -> Result<Outcome, TrainError> {
     let clip = seeded_clip(ClipShape { num_context: 4, num_targets: 1, size: [8, 8] }, 0, 0);
     // Coordinates that binary numbers do not represent exactly.
-    let scaled = |pose: &Pose| Pose { translation: pose.translation * 1.1, ..*pose };
+    let scaled = |camera: &Camera| Pose { translation: camera.c2w.translation * 1.1, ..camera.c2w };
     let moved = |pose: &Pose| {
         let translation = baseline * pose.translation + distance;
         let round = |value: f64| if in_f32 { f64::from(value as f32) } else { value };
         Pose { translation: translation.map(round), ..*pose }
     };
-    let here: Vec<Pose> = clip.context.c2w.iter().map(scaled).collect();
+    let here: Vec<Pose> = clip.context.cameras.iter().map(scaled).collect();
     let away: Vec<Pose> = here.iter().map(moved).collect();
     let [here, away] = [here, away].map(|poses| {
         let frame = PoseNormalization::find("far", &poses, &[], PoseRotation::default(), PoseScale::default())?;
-        Ok(poses.iter().map(|pose| frame.normalize(*pose)).collect::<Vec<_>>())
+        Ok::<_, DataError>(poses.iter().map(|pose| frame.normalize(*pose)).collect::<Vec<_>>())
     });
     let away = match away {
         Ok(away) => away,
-        Err(clift_data::DataError::ZeroBaseline { .. }) => {
+        Err(DataError::Camera(CameraError::ZeroBaseline { .. })) => {
             return Ok(Outcome::Refused(away.expect_err("it is one").to_string()));
         }
         Err(other) => return Err(other.into()),

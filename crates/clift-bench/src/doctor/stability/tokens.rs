@@ -2,8 +2,7 @@
 
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
-use clift_eval::{upload_cameras, upload_views};
-use clift_model::{ModelError, TokenFormat};
+use clift_model::{Cameras, ModelError, TokenFormat, Views};
 use clift_train::{TrainError, seeded_clip, seeded_model};
 
 use crate::cases::reference::{ToF64, largest_magnitude, module_in_f64, values};
@@ -65,12 +64,12 @@ fn render_error(devices: &CaseDevices, storage: TokenFormat) -> Result<Outcome, 
     let config = network(devices);
     let networks = seeded_model(&config, 0, &devices.device).valid();
     let clip = seeded_clip(shape(devices, 4), 0, 0);
-    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &devices.device)?);
+    let lift = networks.encoder.forward(&Views::upload(&[&clip.context], &devices.device)?);
     let shape = lift.dims();
     let tokens: Vec<f32> = values(lift.values.clone()).into_iter().map(|value| value as f32).collect();
     let rounded = TensorData::new(storage.round(&tokens, config.dim)?, shape);
     let rounded: Tensor<3> = Tensor::from_data(rounded, &devices.device);
-    let cameras = upload_cameras(&[&clip.target], &devices.device)?;
+    let cameras = Cameras::upload(&[&clip.target], &devices.device)?;
     let rendering = networks.renderer.forward(lift.with_values(rounded), &cameras);
     let renderer = module_in_f64(&networks.renderer, &devices.reference);
     let expected = renderer.forward(lift.in_f64(&devices.reference), &cameras.in_f64(&devices.reference));

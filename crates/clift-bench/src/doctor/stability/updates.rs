@@ -1,6 +1,7 @@
 //! Whole updates, loss and gradients, on extreme views.
 
-use clift_data::{Clip, ClipViews, MAX_COORDINATE};
+use clift_core::{ClipViews, MAX_COORDINATE};
+use clift_data::Clip;
 use clift_model::{Architecture, CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
 use clift_train::{ClipShape, Stage, StageBatch, TrainError, freeze, seeded_batch, seeded_model};
 
@@ -11,9 +12,10 @@ pub(crate) const CASES: &[StabilityCase] = &[
     StabilityCase::update("identical contexts", "scores of tokens that are equal", |devices| {
         changed_views(devices, 4, |clip| {
             let views = &mut clip.context;
-            let image = views.images[..views.images.len() / views.c2w.len()].to_vec();
-            views.images = image.repeat(views.c2w.len());
-            views.c2w = vec![views.c2w[0]; views.c2w.len()];
+            let image = views.images[..views.images.len() / views.num_views()].to_vec();
+            views.images = image.repeat(views.num_views());
+            let c2w = views.cameras[0].c2w;
+            views.cameras.iter_mut().for_each(|camera| camera.c2w = c2w);
         })
     }),
     StabilityCase::update("zero baseline: every camera at the origin", "moments that are zero", |devices| {
@@ -58,9 +60,9 @@ pub(crate) const CASES: &[StabilityCase] = &[
     }),
     StabilityCase::update("target is a context", "scores of a ray with itself", |devices| {
         changed_views(devices, 4, |clip| {
-            let len = clip.context.images.len() / clip.context.c2w.len();
-            for (target, pose) in clip.target.c2w.iter_mut().enumerate() {
-                *pose = clip.context.c2w[target];
+            let len = clip.context.images.len() / clip.context.num_views();
+            for (target, camera) in clip.target.cameras.iter_mut().enumerate() {
+                camera.c2w = clip.context.cameras[target].c2w;
                 clip.target.images[target * len..][..len].copy_from_slice(&clip.context.images[target * len..][..len]);
             }
         })
@@ -160,22 +162,22 @@ fn all_views(clip: &mut Clip) -> [&mut ClipViews; 2] {
 }
 
 fn move_cameras(clip: &mut Clip, to: impl Fn(f64) -> f64) {
-    for pose in all_views(clip).into_iter().flat_map(|views| &mut views.c2w) {
-        pose.translation = pose.translation.map(&to);
+    for camera in all_views(clip).into_iter().flat_map(|views| &mut views.cameras) {
+        camera.c2w.translation = camera.c2w.translation.map(&to);
     }
 }
 
 fn shift_cameras(clip: &mut Clip, by: f64) {
-    for pose in all_views(clip).into_iter().flat_map(|views| &mut views.c2w) {
-        pose.translation += by;
+    for camera in all_views(clip).into_iter().flat_map(|views| &mut views.cameras) {
+        camera.c2w.translation += by;
     }
 }
 
 fn field_of_view(clip: &mut Clip, degrees: f64) {
     for views in all_views(clip) {
         let focal = views.width as f64 / 2.0 / (degrees / 2.0).to_radians().tan();
-        for intrinsics in &mut views.intrinsics {
-            (intrinsics.fx, intrinsics.fy) = (focal, focal);
+        for camera in &mut views.cameras {
+            (camera.intrinsics.fx, camera.intrinsics.fy) = (focal, focal);
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Sampled views stay within the bounds of the sampler, and equal those of an implementation in Python.
 
 use super::*;
-use crate::random::item_rng;
+use clift_core::item_rng;
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 

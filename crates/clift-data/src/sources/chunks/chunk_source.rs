@@ -4,12 +4,11 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, widest_fov_deg};
 use crate::image::codec::decode_image;
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::index::read_index;
@@ -94,7 +93,7 @@ impl ChunkSource {
     /// Scenes of missing chunks, and with filters unreadable scenes, are skipped and reported with the error.
     ///
     /// # Errors
-    /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is no map from keys to files
+    /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is not a map from keys to files
     /// beside it, [`DataError::BadConfig`] for invalid filters, and the error of the first chunk if every chunk fails.
     pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
         let folder = root.join(split.to_string());
@@ -280,7 +279,7 @@ impl SceneSource for ChunkSource {
         Ok(self.table(scene)?.1.url.clone())
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_cameras(path)
     }

@@ -5,12 +5,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
+use clift_core::{replace_file, widest_fov_deg};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
-use crate::geometry::camera::widest_fov_deg;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 
 /// Version of the file; other versions are ignored.

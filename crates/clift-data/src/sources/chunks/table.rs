@@ -3,8 +3,9 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use clift_core::{Camera, IntrinsicsNorm};
+
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::image::codec::check_encoded;
 use crate::sources::chunks::writer::{camera_bytes, timestamp_bytes};
 use crate::torch::archive::{Archive, ByteSpan};
@@ -64,7 +65,7 @@ impl Builder<'_> {
     fn add(&mut self, scene: &Value) -> Result<(), String> {
         let Self { pickle, archive, .. } = *self;
         let item = |name: &str| pickle.item(scene, name).ok_or_else(|| format!("no entry `{name}`"));
-        let Value::Str(key) = item("key")? else { return Err("`key` is no string".into()) };
+        let Value::Str(key) = item("key")? else { return Err("`key` is not a string".into()) };
         let in_scene = |what: String| format!("key {key:?}: {what}");
         if self.scenes.contains_key(key) {
             return Err(in_scene("it occurs twice".into()));
@@ -77,7 +78,7 @@ impl Builder<'_> {
         if self.url_bytes > MAX_BYTES {
             return Err(in_scene(format!("the `url`s so far have more than the limit of {MAX_BYTES} bytes")));
         }
-        let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is no list".into())) };
+        let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is not a list".into())) };
         self.num_frames += image_ids.len();
         if self.num_frames > MAX_FRAMES {
             return Err(in_scene(format!("the scenes so far have more than the limit of {MAX_FRAMES} frames")));
@@ -102,7 +103,7 @@ impl Builder<'_> {
 }
 
 impl SceneTable {
-    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera>, DataError> {
+    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let bytes = self.cameras.read(path)?;
         let numbers: Vec<f64> = match self.camera_type {
             ElementType::F64 => bytes.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
@@ -132,7 +133,12 @@ impl SceneTable {
     }
 
     /// Returns whether these time stamps and cameras, one per frame, equal those of the file after rounding to f32.
-    pub fn is_of(&self, path: &Path, timestamps: &[i64], cameras: &[Camera]) -> Result<bool, DataError> {
+    pub fn is_of(
+        &self,
+        path: &Path,
+        timestamps: &[i64],
+        cameras: &[Camera<IntrinsicsNorm>],
+    ) -> Result<bool, DataError> {
         Ok(self.timestamps.read(path)? == timestamp_bytes(timestamps)
             && self.cameras.read(path)? == camera_bytes(cameras))
     }

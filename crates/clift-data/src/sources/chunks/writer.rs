@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use clift_core::{Camera, IntrinsicsNorm, replace_file};
+
 use crate::error::DataError;
-use crate::files::atomic::replace_file;
-use crate::geometry::camera::Camera;
 use crate::torch::pickle_writer::PickleWriter;
 use crate::torch::values::{MAX_BYTES, MAX_VALUES};
 
@@ -22,7 +22,7 @@ pub struct SceneRecord {
     /// One per frame: microseconds for RealEstate10K, frame numbers for DL3DV.
     pub timestamps: Vec<i64>,
     /// One per frame.
-    pub cameras: Vec<Camera>,
+    pub cameras: Vec<Camera<IntrinsicsNorm>>,
     /// One JPEG or PNG file per frame.
     pub images: Vec<Vec<u8>>,
 }
@@ -169,7 +169,7 @@ pub(crate) fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
 }
 
 /// Returns cameras in the format of a chunk: rows of 18 f32.
-pub(crate) fn camera_bytes(cameras: &[Camera]) -> Vec<u8> {
+pub(crate) fn camera_bytes(cameras: &[Camera<IntrinsicsNorm>]) -> Vec<u8> {
     let rows = cameras.iter().flat_map(Camera::to_re10k);
     rows.flat_map(|number| (number as f32).to_le_bytes()).collect()
 }
@@ -240,7 +240,7 @@ mod tests {
             }
             for (got, expected) in source.cameras(scene).unwrap().iter().zip(&record.cameras) {
                 assert_eq!(got.c2w, expected.c2w); // whole numbers, so f32 loses nothing
-                assert!((got.intrinsics_norm.fx - 0.9).abs() < 1e-7); // f32
+                assert!((got.intrinsics.fx - 0.9).abs() < 1e-7); // f32
             }
         }
     }

@@ -6,17 +6,15 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::UNIX_EPOCH;
 
+use clift_core::{BadConfig, RgbImage, TEMPORARY, check_config};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::bad_config::{BadConfig, check_config};
 use crate::error::DataError;
-use crate::files::atomic::TEMPORARY;
 use crate::files::caches::cache_folder;
 use crate::files::listing::has_ending;
 use crate::image::fit::covering_size;
 use crate::image::lanczos::resize_lanczos;
-use crate::image::rgb_image::RgbImage;
 use crate::sources::photos::photo::Photo;
 
 /// Start of a file; the number changes with the pixels that a photo gives.
@@ -188,12 +186,11 @@ fn read(path: &Path) -> Option<RgbImage> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
     use crate::geometry::lens::Lens;
-    use crate::geometry::pose::Pose;
     use crate::image::codec::{encode_jpeg, encode_png};
     use crate::image::fit::fit_image;
     use crate::testing::{names, ramp};
+    use clift_core::{IntrinsicsNorm, Pose};
 
     const K: IntrinsicsNorm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.52 };
 
@@ -225,7 +222,7 @@ mod tests {
         let cache = cache(root.path(), 1_000_000);
         for (name, lens) in [("a.png", Lens { radial: [0.0; 3], tangential: [0.0; 2] }), ("b.png", distorted)] {
             let photo = photo(root.path(), name, &ramp(647, 801), lens);
-            let fitted = |image: &RgbImage| fit_image(image, photo.camera.intrinsics_norm, 32, 32, false).unwrap();
+            let fitted = |image: &RgbImage| fit_image(image, photo.camera.intrinsics, 32, 32, false).unwrap();
             let expected = fitted(&photo.decode("k", 0).unwrap());
             for is_decoded in [true, false] {
                 let (image, was_decoded) = read_through(&cache, &photo);

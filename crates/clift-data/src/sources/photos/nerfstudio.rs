@@ -7,15 +7,14 @@ use std::fmt;
 use std::marker::PhantomData;
 use std::path::Path;
 
+use clift_core::{Intrinsics, IntrinsicsNorm, Pose, folder_of};
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
 use crate::error::DataError;
 use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::natural_order;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
-use crate::geometry::pose::Pose;
 use crate::image::codec::read_header;
 use crate::sources::photos::image_locator::ImageLocator;
 use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
@@ -161,7 +160,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
     let document: Document = parse_json(&text).map_err(|error| bad(explain(&error, &text)))?;
     drop(text);
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
     if let Some(Entry { file_path: name, .. }) = entries.iter().find(|entry| entry.file_path.len() > MAX_NAME_BYTES) {
         let start: String = name.chars().take(40).collect();
@@ -192,6 +191,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
         let rows = entry.c2w_rows().map_err(in_frame)?;
         let photo = Pose::from_opengl(&rows)
+            .map_err(DataError::from)
             .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)))
             .map_err(PhotoScene::in_frame(path, name))?;
         scene.photos.push(photo);

@@ -2,15 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_core::{Camera, IntrinsicsNorm, Pose, RgbImage};
 use image::metadata::Orientation;
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
-use crate::geometry::pose::Pose;
 use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
-use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
 pub(crate) const MAX_FRAMES: usize = 100_000;
@@ -33,7 +31,7 @@ pub(crate) struct PhotoOptions {
 pub(crate) struct Photo {
     pub path: PathBuf,
     /// Pinhole camera of the loaded image.
-    pub camera: Camera,
+    pub camera: Camera<IntrinsicsNorm>,
     /// Undistortion applied on load.
     pub undistortion: Option<Box<Undistortion>>,
     /// Aspect ratio (width over height) of the images to which the intrinsics apply.
@@ -88,10 +86,16 @@ impl Photo {
         intrinsics_norm.validate()?;
         let (time, shape) = (number_at_end(&path), size.map(|[width, height]| width / height));
         if !undistort || lens.is_pinhole() {
-            return Ok(Self { path, camera: Camera { intrinsics_norm, c2w }, undistortion: None, shape, time });
+            return Ok(Self {
+                path,
+                camera: Camera { intrinsics: intrinsics_norm, c2w },
+                undistortion: None,
+                shape,
+                time,
+            });
         }
         let undistortion = Undistortion::new(intrinsics_norm, lens)?;
-        let camera = Camera { intrinsics_norm: undistortion.intrinsics_norm(), c2w };
+        let camera = Camera { intrinsics: undistortion.intrinsics_norm(), c2w };
         Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape, time })
     }
 

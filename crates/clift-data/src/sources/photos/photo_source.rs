@@ -3,11 +3,10 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::{Camera, widest_fov_deg};
-use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
@@ -248,7 +247,7 @@ impl SceneSource for PhotoSource {
         Ok(self.entry(scene)?.num_frames)
     }
 
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         Ok(self.scene(scene)?.photos.iter().map(|photo| photo.camera).collect())
     }
 

@@ -3,9 +3,10 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use clift_core::{Camera, IntrinsicsNorm};
+
 use crate::error::DataError;
 use crate::files::bounded::{read_bounded, read_start};
-use crate::geometry::camera::Camera;
 use crate::sources::photos::image_folder::numbered_images;
 use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene};
 
@@ -59,7 +60,7 @@ fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Strin
     Ok(scene)
 }
 
-fn parse_line(line: &str) -> Result<(i64, Camera), String> {
+fn parse_line(line: &str) -> Result<(i64, Camera<IntrinsicsNorm>), String> {
     let words: Vec<&str> = line.split_ascii_whitespace().take(NUM_COLUMNS + 1).collect();
     if words.len() != NUM_COLUMNS {
         let more = if words.len() > NUM_COLUMNS { "more" } else { &words.len().to_string() };

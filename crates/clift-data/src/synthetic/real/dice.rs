@@ -1,8 +1,7 @@
 //! Random choices of one scene.
 
+use clift_core::{uniform_01, uniform_below};
 use rand_chacha::ChaCha8Rng;
-
-use crate::random::{uniform_01, uniform_below};
 
 /// The random stream of one scene, with the distributions that the scene needs.
 pub(crate) struct Dice(pub ChaCha8Rng);

@@ -2,10 +2,9 @@
 
 use std::f32::consts::TAU;
 
+use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::{DMat3, Vec3, Vec4};
 
-use crate::geometry::camera::{Camera, IntrinsicsNorm};
-use crate::geometry::pose::Pose;
 use crate::synthetic::real::dice::Dice;
 use crate::synthetic::tracing::noise::{byte, hash};
 use crate::synthetic::tracing::solid::Rays;
@@ -21,7 +20,7 @@ const GLANCE: usize = 6;
 /// then begin at any pixel, as those of shifted patch grids do.
 const OFF_CENTER: f32 = 1.0 / 32.0;
 
-/// Where a camera may go.
+/// Region that a camera path may enter.
 pub(crate) struct Area {
     /// Middle and half sizes of the box in which a path starts (y is down).
     pub center: Vec3,
@@ -160,7 +159,7 @@ impl Path {
         let camera = self.camera(time, 1.0, 0);
         let origin = camera.c2w.translation.as_vec3();
         let rotation = camera.c2w.rotation.as_mat3();
-        let scale = 1.0 / (camera.intrinsics_norm.fx as f32 * SIDE as f32);
+        let scale = 1.0 / (camera.intrinsics.fx as f32 * SIDE as f32);
         (0..SIDE * SIDE).step_by(4).flat_map(move |first| {
             let at = |step: usize| (step as f32 + 0.5 - 0.5 * SIDE as f32) * scale;
             let lanes = [0, 1, 2, 3].map(|lane| first + lane);
@@ -185,7 +184,7 @@ impl Path {
     }
 
     /// Returns the camera of one frame, with square pixels and a principal point of its own.
-    pub fn camera(&self, time: f32, aspect: f64, frame: usize) -> Camera {
+    pub fn camera(&self, time: f32, aspect: f64, frame: usize) -> Camera<IntrinsicsNorm> {
         let position = self.position(time);
         let [mut yaw, mut pitch, roll] = self.shake.map(|wave| sway(wave, time));
         match &self.route {
@@ -207,7 +206,7 @@ impl Path {
         let shift = hash(frame as i32, 1, self.seed);
         let [cx, cy] = [0, 1].map(|part| f64::from(0.5 + OFF_CENTER * (2.0 * byte(shift, part) - 1.0)));
         Camera {
-            intrinsics_norm: IntrinsicsNorm { fx, fy: fx * aspect, cx, cy },
+            intrinsics: IntrinsicsNorm { fx, fy: fx * aspect, cx, cy },
             c2w: Pose { rotation, translation: position.as_dvec3() },
         }
     }

@@ -2,11 +2,10 @@
 
 use std::f32::consts::TAU;
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::synthetic::real::builder::{Builder, Place};
 use crate::synthetic::real::dice::Dice;
 use crate::synthetic::real::palette::color;
@@ -54,11 +53,11 @@ impl RealScene {
     }
 
     /// Returns the camera of a frame; `time` runs from 0 to 1.
-    pub fn camera(&self, time: f64, aspect: f64, frame: usize) -> Camera {
+    pub fn camera(&self, time: f64, aspect: f64, frame: usize) -> Camera<IntrinsicsNorm> {
         self.path.camera(time as f32, aspect, frame)
     }
 
-    pub fn render(&self, camera: &Camera, size: [usize; 2]) -> RgbImage {
+    pub fn render(&self, camera: &Camera<IntrinsicsNorm>, size: [usize; 2]) -> RgbImage {
         render(&self.world, &self.light, &self.exposure, camera, size)
     }
 }
@@ -203,7 +202,7 @@ fn expose(dice: &mut Dice, world: &World, light: &Light, path: &Path) -> Exposur
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
+    use clift_core::step_rng;
 
     fn scene(number: u64) -> RealScene {
         RealScene::sample(step_rng(4, number, "test"))
@@ -220,7 +219,7 @@ mod tests {
                 let camera = scene.camera(f64::from(frame) / 19.0, 1.0, frame as usize);
                 assert!(camera.c2w.orthonormality_defect() < 1e-6);
                 assert!(camera.c2w.rotation.y_axis.y > 0.3, "scene {number} is upside down");
-                let fov = 2.0 * (0.5 / camera.intrinsics_norm.fx).atan().to_degrees();
+                let fov = 2.0 * (0.5 / camera.intrinsics.fx).atan().to_degrees();
                 assert!((39.9..100.1).contains(&fov), "{fov}");
             }
         }

@@ -1,9 +1,8 @@
 //! Frames: four rays per pixel, one shading per surface and pixel, in blocks of 2 x 2 pixels.
 
+use clift_core::{Camera, IntrinsicsNorm, RgbImage};
 use glam::{Vec3, Vec4};
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
 use crate::synthetic::tracing::light::{End, Light};
 use crate::synthetic::tracing::solid::Rays;
 use crate::synthetic::tracing::world::{SKY, World};
@@ -38,7 +37,7 @@ impl Exposure {
     }
 }
 
-/// What is seen of one surface in a block of 2 x 2 pixels.
+/// Visible part of one surface in a block of 2 x 2 pixels.
 #[derive(Clone, Copy)]
 struct Part {
     number: usize,
@@ -59,10 +58,10 @@ pub(crate) fn render(
     world: &World,
     light: &Light,
     exposure: &Exposure,
-    camera: &Camera,
+    camera: &Camera<IntrinsicsNorm>,
     [width, height]: [usize; 2],
 ) -> RgbImage {
-    let intrinsics = camera.intrinsics_norm.to_pixels(width, height);
+    let intrinsics = camera.intrinsics.to_pixels(width, height);
     let origin = camera.c2w.translation.as_vec3();
     let rotation = camera.c2w.rotation.as_mat3();
     let pixel = (1.0 / intrinsics.fx) as f32;

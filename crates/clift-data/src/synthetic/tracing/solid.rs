@@ -45,7 +45,7 @@ impl Rays {
     }
 }
 
-/// Where four lines enter and leave a solid; a line misses it where `near > far`.
+/// Distances at which four lines enter and leave a solid; a line misses it if `near > far`.
 #[derive(Clone, Copy)]
 pub(crate) struct Spans {
     pub near: Vec4,
@@ -218,8 +218,8 @@ fn largest_axis(v: Vec3) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::step_rng;
     use crate::synthetic::real::dice::Dice;
+    use clift_core::step_rng;
 
     /// Returns whether a point lies in the shape, by its definition.
     fn contains(solid: &Solid, point: Vec3) -> bool {

@@ -217,10 +217,10 @@ mod tests {
     use super::*;
     use glam::Mat3;
 
-    use crate::random::step_rng;
     use crate::synthetic::real::dice::Dice;
     use crate::synthetic::tracing::solid::Shape;
     use crate::synthetic::tracing::world::World;
+    use clift_core::step_rng;
 
     #[test]
     fn walks_and_lists_find_the_nearest_of_all_solids() {

@@ -1,8 +1,7 @@
 //! Checks of intrinsics and poses without the images.
 
-use crate::geometry::camera::Camera;
-use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale};
-use crate::geometry::pose::Pose;
+use clift_core::{Camera, IntrinsicsNorm, Pose, PoseNormalization, PoseRotation, PoseScale};
+
 use crate::tools::check::images::Sizes;
 use crate::tools::check::result::SceneCheck;
 
@@ -21,7 +20,7 @@ const MAX_DEFECT: f64 = 1e-3;
 /// Entry of `R^T R - I` above which a note is added; f32 files stay below.
 const NOTED_DEFECT: f64 = 1e-4;
 
-pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
+pub(crate) fn check_cameras(cameras: &[Camera<IntrinsicsNorm>], sizes: &Sizes, check: &mut SceneCheck) {
     if cameras.is_empty() {
         check.reasons.push("the scene has no frames".into());
         return;
@@ -43,11 +42,11 @@ pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut Scene
     }
 }
 
-fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
-    let frames_where = |test: &dyn Fn(&Camera) -> bool| -> Vec<usize> {
+fn check_intrinsics(cameras: &[Camera<IntrinsicsNorm>], sizes: &Sizes, check: &mut SceneCheck) {
+    let frames_where = |test: &dyn Fn(&Camera<IntrinsicsNorm>) -> bool| -> Vec<usize> {
         cameras.iter().enumerate().filter(|(_, camera)| test(camera)).map(|(frame, _)| frame).collect()
     };
-    let fields = |camera: &Camera| {
+    let fields = |camera: &Camera<IntrinsicsNorm>| {
         let (x, y) = camera.fov_deg();
         [x.min(y), x.max(y)]
     };
@@ -71,11 +70,11 @@ fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     let [low, high] = PRINCIPAL_POINT;
     let middle = low..=high;
     let outside = frames_where(&|camera| {
-        let k = camera.intrinsics_norm;
+        let k = camera.intrinsics;
         !middle.contains(&k.cx) || !middle.contains(&k.cy)
     });
     if let Some(&first) = outside.first() {
-        let k = cameras[first].intrinsics_norm;
+        let k = cameras[first].intrinsics;
         let frames = check.list_frames(&outside);
         check.reasons.push(format!(
             "principal point at ({:.3}, {:.3}) of the image in {frames}, expected {low} to {high}",
@@ -83,7 +82,7 @@ fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
         ));
     }
     let aspects = cameras.iter().zip(sizes).filter_map(|(camera, size)| {
-        let k = camera.intrinsics_norm;
+        let k = camera.intrinsics;
         size.map(|[width, height]| (k.fx * width as f64) / (k.fy * height as f64))
     });
     let off = |aspect: f64| aspect.max(1.0 / aspect);

@@ -1,8 +1,8 @@
 //! An image of two frames side by side with matched corners and their epipolar lines.
 
+use clift_core::RgbImage;
 use glam::DMat3;
 
-use crate::image::rgb_image::RgbImage;
 use crate::tools::check::matches::subsample;
 use crate::tools::features::epipolar::{Correspondence, WIDTH, line, line_back};
 use crate::tools::features::image_features::reduced;
@@ -78,6 +78,7 @@ fn blend(pixel: &mut [u8], colour: [u8; 3], share: f64) {
 
 #[cfg(test)]
 mod tests {
+
     use super::*;
 
     #[test]

@@ -1,11 +1,10 @@
 //! Check of the poses against the images: matched corners must lie on each other's epipolar lines, and where other frames
 //! place them.
 
-use crate::geometry::camera::Camera;
-use crate::image::rgb_image::RgbImage;
+use clift_core::{Camera, IntrinsicsNorm, RgbImage, median};
+
 use crate::scene_source::SceneSource;
 use crate::skip_report::plural;
-use crate::statistics::median;
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::frames::{exchange_neighbours, frame_distances, triplet_distances, wrong_frames};
 use crate::tools::check::images::Sizes;
@@ -34,7 +33,7 @@ pub(crate) struct Compared<'a> {
     /// Positions in the scene from one frame to the next.
     pub step: usize,
     /// Cameras of all frames of the scene.
-    pub cameras: &'a [Camera],
+    pub cameras: &'a [Camera<IntrinsicsNorm>],
     /// Sizes of all frames of the scene.
     pub sizes: &'a Sizes,
     /// Corners of the compared frames, `None` for an unreadable one.
@@ -49,10 +48,12 @@ pub(crate) fn check_poses(
     check: &mut SceneCheck,
 ) -> Option<RgbImage> {
     let &Compared { step, cameras, sizes, .. } = compared;
-    let cameras: Vec<Camera> = cameras.iter().copied().step_by(step).collect();
+    let cameras: Vec<Camera<IntrinsicsNorm>> = cameras.iter().copied().step_by(step).collect();
     let sizes = sizes.iter().step_by(step);
     // The camera of an unreadable frame is not used.
-    let view = |(camera, size): (&Camera, &Option<[usize; 2]>)| PixelCamera::new(camera, size.unwrap_or([1, 1]));
+    let view = |(camera, size): (&Camera<IntrinsicsNorm>, &Option<[usize; 2]>)| {
+        PixelCamera::new(camera, size.unwrap_or([1, 1]))
+    };
     let views: Vec<PixelCamera> = cameras.iter().zip(sizes).map(view).collect();
     let pairs = match_frames(&compared.features, &cameras);
     let distances: Vec<Vec<f64>> = pairs.iter().map(|pair| epipolar_distances(&views, pair)).collect();

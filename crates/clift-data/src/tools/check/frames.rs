@@ -1,6 +1,7 @@
 //! Each frame against the others: exchanged neighbours, and single cameras that do not fit.
 
-use crate::statistics::median;
+use clift_core::median;
+
 use crate::tools::check::triplets::Triplet;
 use crate::tools::features::pixel_camera::PixelCamera;
 

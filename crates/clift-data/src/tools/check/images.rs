@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{DefaultHasher, Hash, Hasher};
 
+use clift_core::{Camera, IntrinsicsNorm};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::features::image_features::Features;
@@ -19,7 +19,7 @@ const MAX_TURN_DEG: f64 = 1.0;
 /// Columns and rows of every frame, `None` for an unreadable frame.
 pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
 
-/// What the checks need of a decoded image.
+/// Features of a decoded image that the checks use.
 struct SeenImage {
     size: [usize; 2],
     hash: u64,
@@ -30,7 +30,7 @@ struct SeenImage {
 pub(crate) fn check_images(
     source: &dyn SceneSource,
     scene: usize,
-    cameras: &[Camera],
+    cameras: &[Camera<IntrinsicsNorm>],
     step: usize,
     check: &mut SceneCheck,
 ) -> (Sizes, Vec<Option<Features>>) {
@@ -63,7 +63,7 @@ pub(crate) fn check_images(
     (sizes, read.into_iter().step_by(step).map(|read| read.ok()?.features).collect())
 }
 
-fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
+fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera<IntrinsicsNorm>], check: &mut SceneCheck) {
     let extent = extent(cameras);
     let mut seen: HashMap<u64, usize> = HashMap::new();
     let (mut equal, mut contradictions) = (Vec::new(), Vec::new());
@@ -88,11 +88,11 @@ fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut
 }
 
 /// Returns the distance of the centres, and the angle between the orientations in degrees.
-fn camera_distance(a: &Camera, b: &Camera) -> (f64, f64) {
+fn camera_distance(a: &Camera<IntrinsicsNorm>, b: &Camera<IntrinsicsNorm>) -> (f64, f64) {
     (a.c2w.translation.distance(b.c2w.translation), a.c2w.angle_to(b.c2w).to_degrees())
 }
 
 /// Returns the largest distance of a camera centre from the first.
-fn extent(cameras: &[Camera]) -> f64 {
+fn extent(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
     cameras.iter().map(|camera| camera_distance(&cameras[0], camera).0).fold(0.0, f64::max)
 }

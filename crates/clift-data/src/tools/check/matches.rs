@@ -1,8 +1,8 @@
 //! Corners matched between the frames of a scene. The cameras do not decide which corners match.
 
+use clift_core::{Camera, IntrinsicsNorm};
 use rayon::prelude::*;
 
-use crate::geometry::camera::Camera;
 use crate::tools::features::epipolar::Correspondence;
 use crate::tools::features::image_features::Features;
 
@@ -24,7 +24,7 @@ pub(crate) struct FramePair {
 
 /// Matches the corners of frames 1, 2, 4, 8, .. apart, of every pair in short scenes. `None` stands for a frame that is
 /// not compared.
-pub(crate) fn match_frames(features: &[Option<Features>], cameras: &[Camera]) -> Vec<FramePair> {
+pub(crate) fn match_frames(features: &[Option<Features>], cameras: &[Camera<IntrinsicsNorm>]) -> Vec<FramePair> {
     let num_frames = features.len();
     let matched = |frames: Vec<[usize; 2]>| -> Vec<FramePair> {
         frames.into_par_iter().filter_map(|frames| match_pair(features, cameras, frames)).collect()
@@ -57,7 +57,7 @@ fn pairs_in_order(num_frames: usize) -> Vec<[usize; 2]> {
 }
 
 /// Returns the pairs of a frame with the frames of the most similar cameras.
-fn nearest_pairs(cameras: &[Camera], frame: usize) -> impl Iterator<Item = [usize; 2]> {
+fn nearest_pairs(cameras: &[Camera<IntrinsicsNorm>], frame: usize) -> impl Iterator<Item = [usize; 2]> {
     let mut others: Vec<usize> = (0..cameras.len()).filter(|other| *other != frame).collect();
     let away = |other: &usize| dissimilarity(&cameras[frame], &cameras[*other]);
     others.sort_by(|a, b| away(a).total_cmp(&away(b)));
@@ -65,14 +65,18 @@ fn nearest_pairs(cameras: &[Camera], frame: usize) -> impl Iterator<Item = [usiz
 }
 
 /// Returns the distance of the centres plus three times the distance of the forward directions.
-fn dissimilarity(a: &Camera, b: &Camera) -> f64 {
+fn dissimilarity(a: &Camera<IntrinsicsNorm>, b: &Camera<IntrinsicsNorm>) -> f64 {
     let forward = a.c2w.rotation.z_axis.distance(b.c2w.rotation.z_axis);
     a.c2w.translation.distance(b.c2w.translation) + 3.0 * forward
 }
 
 /// Matches the corners of two frames. Returns `None` if too few match, and for cameras with one centre, which have no
 /// epipolar lines.
-fn match_pair(features: &[Option<Features>], cameras: &[Camera], frames: [usize; 2]) -> Option<FramePair> {
+fn match_pair(
+    features: &[Option<Features>],
+    cameras: &[Camera<IntrinsicsNorm>],
+    frames: [usize; 2],
+) -> Option<FramePair> {
     let [first, second] = frames;
     if cameras[first].c2w.translation == cameras[second].c2w.translation {
         return None;

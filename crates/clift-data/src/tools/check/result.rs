@@ -37,7 +37,7 @@ pub struct SceneCheck {
     /// Median symmetric epipolar distance of matched corners, in pixels of an image 640 columns wide; `None` if too few
     /// corners match.
     pub epipolar_px: Option<f64>,
-    /// Observations that are no errors.
+    /// Observations that are not errors.
     pub notes: Vec<String>,
     /// Columns and rows of most frames.
     pub image_size: Option<[usize; 2]>,

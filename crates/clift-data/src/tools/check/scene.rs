@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::image::rgb_image::RgbImage;
+use clift_core::RgbImage;
+
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, plural};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;

@@ -5,9 +5,9 @@
 
 use std::collections::HashMap;
 
+use clift_core::median;
 use glam::DVec3;
 
-use crate::statistics::median;
 use crate::tools::check::matches::{FramePair, subsample};
 use crate::tools::features::pixel_camera::PixelCamera;
 
@@ -109,8 +109,7 @@ fn transferred(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::{Camera, IntrinsicsNorm};
-    use crate::geometry::pose::Pose;
+    use clift_core::{Camera, IntrinsicsNorm, Pose};
     use glam::DMat3;
 
     #[test]
@@ -118,7 +117,7 @@ mod tests {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.48 };
         let camera = |x: f64, angle: f64| {
             let c2w = Pose { rotation: DMat3::from_rotation_y(angle), translation: DVec3::new(x, 0.1 * x, 0.0) };
-            PixelCamera::new(&Camera { intrinsics_norm, c2w }, [320, 240])
+            PixelCamera::new(&Camera { intrinsics: intrinsics_norm, c2w }, [320, 240])
         };
         let cameras = [camera(0.0, 0.1), camera(0.4, 0.0), camera(1.0, -0.2)];
         for point in [DVec3::new(0.3, -0.2, 4.0), DVec3::new(-30.0, 200.0, 1e9)] {

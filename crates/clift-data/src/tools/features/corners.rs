@@ -104,7 +104,7 @@ fn measure(gray: &GrayImage) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::rgb_image::RgbImage;
+    use clift_core::RgbImage;
 
     #[test]
     fn corners_of_a_square_are_found_without_its_edges() {

@@ -83,7 +83,7 @@ fn add(sums: &mut [f32], [across, down, turn]: [f32; 3], strength: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::rgb_image::RgbImage;
+    use clift_core::RgbImage;
 
     fn waves(shift: f64, contrast: f64) -> GrayImage {
         let (width, height) = (64, 64);

@@ -1,8 +1,7 @@
 //! Epipolar lines, and fundamental matrices of matched corners by RANSAC.
 
+use clift_core::{step_rng, uniform_below};
 use glam::{DMat3, DVec3};
-
-use crate::random::{step_rng, uniform_below};
 
 /// Number of columns to which wider images are reduced. Distances are in pixels of this width.
 pub const WIDTH: usize = 640;
@@ -127,19 +126,17 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::{Camera, IntrinsicsNorm};
-    use crate::geometry::pose::Pose;
-    use crate::random::uniform_01;
     use crate::tools::features::pixel_camera::PixelCamera;
+    use clift_core::{Camera, IntrinsicsNorm, Pose, uniform_01};
 
     /// Returns two overlapping cameras, and points that both see.
-    fn scene(num_points: u64) -> ([Camera; 2], Vec<Correspondence>) {
+    fn scene(num_points: u64) -> ([Camera<IntrinsicsNorm>; 2], Vec<Correspondence>) {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.48 };
         let second = Pose { rotation: DMat3::from_rotation_y(0.2), translation: DVec3::new(-0.7, 0.2, 0.1) };
-        let cameras = [Pose::IDENTITY, second].map(|c2w| Camera { intrinsics_norm, c2w });
-        let seen = |camera: &Camera, point: DVec3| {
+        let cameras = [Pose::IDENTITY, second].map(|c2w| Camera { intrinsics: intrinsics_norm, c2w });
+        let seen = |camera: &Camera<IntrinsicsNorm>, point: DVec3| {
             let [x, y, z] = camera.c2w.inverse().apply(point).to_array();
-            let k = camera.intrinsics_norm.to_pixels(640, 480);
+            let k = camera.intrinsics.to_pixels(640, 480);
             [k.fx * x / z + k.cx, k.fy * y / z + k.cy]
         };
         let matches = (0..num_points).map(|i| {

@@ -1,6 +1,6 @@
 //! Gray images in f32: blur and gradients.
 
-use crate::image::rgb_image::RgbImage;
+use clift_core::RgbImage;
 
 /// Brightness in `[0, 255]`, row-major.
 pub(crate) struct GrayImage {

@@ -3,8 +3,9 @@
 //! Corners are found in two sizes of an image, described by the surrounding gradients, matched in both directions, and
 //! kept if they agree with one fundamental matrix.
 
+use clift_core::RgbImage;
+
 use crate::image::lanczos::resize_lanczos;
-use crate::image::rgb_image::RgbImage;
 use crate::tools::features::corners::find_corners;
 use crate::tools::features::descriptor::Descriptor;
 use crate::tools::features::epipolar::{Correspondence, WIDTH, ransac_inliers};

@@ -1,9 +1,8 @@
 //! Cameras in the pixels of matched corners.
 
+use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::{DMat3, DVec3};
 
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
 use crate::tools::features::epipolar::WIDTH;
 
 /// A camera of an image [`WIDTH`] columns wide, whose height keeps the shape of the pixels.
@@ -16,8 +15,8 @@ pub(crate) struct PixelCamera {
 
 impl PixelCamera {
     /// Converts a camera of an image with these columns and rows.
-    pub fn new(camera: &Camera, [columns, rows]: [usize; 2]) -> Self {
-        let k = camera.intrinsics_norm;
+    pub fn new(camera: &Camera<IntrinsicsNorm>, [columns, rows]: [usize; 2]) -> Self {
+        let k = camera.intrinsics;
         let (width, height) = (WIDTH as f64, WIDTH as f64 * rows as f64 / columns as f64);
         let rows = [k.fx * width, 0.0, k.cx * width, 0.0, k.fy * height, k.cy * height, 0.0, 0.0, 1.0];
         Self::with_intrinsics(DMat3::from_rows_array(&rows), camera.c2w)

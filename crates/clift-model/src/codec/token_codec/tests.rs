@@ -179,7 +179,7 @@ fn codecs_survive_their_file_and_damage_is_found() {
     damaged(&|codec| codec.transform.deviations[3] = 0.0, "deviation 0 of direction 3");
     damaged(&|codec| codec.transform.basis[..DIM].fill(0.0), "direction 0 has no length");
     damaged(&|codec| codec.transform.mean[0] = f32::NAN, "`mean` contains NaN");
-    damaged(&|codec| codec.distributions.knots[1] = 90.0, "the knots are no ascending numbers");
+    damaged(&|codec| codec.distributions.knots[1] = 90.0, "the knots are not ascending numbers");
     damaged(&|codec| codec.distributions.cumulative[7] = 0.9, "the probabilities of direction 0");
     damaged(&|codec| codec.prediction.scales[0] = 0.0, "scale 0, expected a positive number");
     damaged(&|codec| codec.rates.steps[0] = 9.0, "`rates` =");

@@ -45,7 +45,7 @@ impl Renderer {
         self.blocks().patches().size
     }
 
-    /// Replaces the number of patch grids, that of the config at first.
+    /// Replaces the number of patch grids, which the config sets at first.
     pub fn set_patch_grids(&mut self, patch_grids: PatchGrids) {
         match self {
             Self::Clift(renderer) => renderer.set_patch_grids(patch_grids),

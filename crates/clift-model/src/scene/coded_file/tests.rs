@@ -2,13 +2,12 @@
 
 use std::path::PathBuf;
 
+use clift_core::{Camera, DMat3, DVec3, Pose, PoseNormalization};
 use safetensors::SafeTensors;
 
 use super::*;
 use crate::codec::token_codec::tests::codec;
-use crate::scene::scene::SceneNormalization;
 use crate::scene::scene::tests::{scene, with_header};
-use crate::views::camera::ViewCamera;
 
 const STEP: f32 = 0.25;
 
@@ -138,12 +137,12 @@ fn hostile_files_with_valid_checksums_are_refused() {
     for (at, value, expected) in [
         (0, &f32::NAN.to_le_bytes()[..], "step NaN"),
         (0, &(-1.0_f32).to_le_bytes(), "step -1"),
-        (4, &f32::NAN.to_le_bytes(), "mean pose: the pose contains NaN"),
-        (4 + 16, &f64::NAN.to_le_bytes(), "mean pose: the pose contains NaN"),
+        (4, &f32::NAN.to_le_bytes(), "mean pose: bad camera: the pose holds NaN"),
+        (4 + 16, &f64::NAN.to_le_bytes(), "mean pose: bad camera: the pose holds NaN"),
         (4 + 40, &(-1.0_f64).to_le_bytes(), "pose scale -1"),
         (4 + 48, &3_u32.to_le_bytes(), "views and coded tokens"),
-        (4 + 48 + 4, &(-1.0_f32).to_le_bytes(), "context camera 0: intrinsics [-1.0"),
-        (4 + 48 + 4 + 16, &f32::NAN.to_le_bytes(), "context camera 0: the pose contains NaN"),
+        (4 + 48 + 4, &(-1.0_f32).to_le_bytes(), "context camera 0: bad camera: fx is -1"),
+        (4 + 48 + 4 + 16, &f32::NAN.to_le_bytes(), "context camera 0: bad camera: the pose holds NaN"),
     ] {
         let mut damaged = bytes.clone();
         damaged[start + at..][..value.len()].copy_from_slice(value);
@@ -190,10 +189,11 @@ fn views_come_back_with_shared_and_with_different_intrinsics() {
     for focal_offset in [0.0, 2.5] {
         let mut original = scene();
         original.context[1].intrinsics = original.context[0].intrinsics;
-        original.context[1].intrinsics[0] += focal_offset;
+        original.context[1].intrinsics.fx += focal_offset;
         // A half turn about an axis, whose quaternion has no real part.
-        original.context[1].c2w[..11].copy_from_slice(&[-1.0, 0.0, 0.0, 0.5, 0.0, 1.0, 0.0, -0.25, 0.0, 0.0, -1.0]);
-        original.world.mean_c2w[3] = 4_321_987.125;
+        let rotation = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
+        original.context[1].c2w = Pose { rotation, translation: DVec3::new(0.5, -0.25, -0.2) };
+        original.world.mean_c2w.translation.x = 4_321_987.125;
         original.write_coded(&folder.path(), &folder.1, STEP).unwrap();
         assert_same_views(&Scene::read(&folder.path()).unwrap().0, &original);
         sizes.push(std::fs::metadata(folder.path()).unwrap().len());
@@ -205,12 +205,11 @@ fn assert_same_views(got: &Scene, expected: &Scene) {
     assert_eq!(got.context_frames, expected.context_frames);
     assert_eq!(got.context.len(), expected.context.len());
     // The center may be far from the origin, in meters of a map: it is stored in f64.
-    let exact = |world: &SceneNormalization| ([3, 7, 11].map(|i| world.mean_c2w[i]), world.scale);
+    let exact = |world: &PoseNormalization| (world.mean_c2w.translation, world.scale);
     assert_eq!(exact(&got.world), exact(&expected.world));
-    let mut entries = got.world.mean_c2w.iter().zip(&expected.world.mean_c2w);
-    assert!(entries.all(|(a, b)| (a - b).abs() < 1e-6), "{:?}", got.world);
+    assert!(got.world.mean_c2w.rotation.abs_diff_eq(expected.world.mean_c2w.rotation, 1e-6), "{:?}", got.world);
     for (got, expected) in got.context.iter().zip(&expected.context) {
-        let values = |camera: &ViewCamera| [&camera.c2w[..], &camera.intrinsics].concat();
+        let values = |camera: &Camera| [&camera.c2w.to_matrix_f64()[..], &camera.intrinsics.to_array()].concat();
         assert!(values(got).iter().zip(values(expected)).all(|(a, b)| (a - b).abs() < 1e-6), "{got:?}");
     }
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clift_core::{DMat3, DVec3, Intrinsics, Pose};
 use safetensors::SafeTensors;
 
 use super::*;
@@ -11,12 +12,9 @@ use crate::testing::small_lvsm;
 
 const DIM: usize = 8;
 
-pub(crate) fn camera(x: f64, angle: f64) -> ViewCamera {
-    let (sin, cos) = angle.sin_cos();
-    ViewCamera {
-        c2w: [cos, 0.0, sin, x, 0.0, 1.0, 0.0, 0.1, -sin, 0.0, cos, -0.2, 0.0, 0.0, 0.0, 1.0],
-        intrinsics: [20.0, 21.0, 12.0, 8.0],
-    }
+pub(crate) fn camera(x: f64, angle: f64) -> Camera {
+    let c2w = Pose { rotation: DMat3::from_rotation_y(angle), translation: DVec3::new(x, 0.1, -0.2) };
+    Camera { c2w, intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 12.0, cy: 8.0 } }
 }
 
 /// Five tokens of two views of 24 x 16 pixels, which have six patches each.
@@ -32,7 +30,7 @@ pub(crate) fn scene() -> Scene {
         width: 24,
         context: vec![camera(-1.0, 0.2), camera(1.0, -0.3)],
         context_frames: vec![3, 41],
-        world: SceneNormalization { mean_c2w: camera(17.0, 1.0).c2w, scale: 0.1 + 0.2 },
+        world: PoseNormalization { mean_c2w: camera(17.0, 1.0).c2w, scale: 0.1 + 0.2 },
         tokens: (0..token_ids.len() * DIM).map(|i| (i as f32 - 17.0) * 0.317).collect(),
         token_ids,
     }
@@ -138,10 +136,10 @@ fn files_are_safetensors_with_rays_through_patch_centres() {
     // Token 0 is patch 0: the first of view 0. Token 3 is patch 7: row 0, column 1 of view 1.
     for (token, camera, [x, y]) in [(0, camera(-1.0, 0.2), [4.0, 4.0]), (3, camera(1.0, -0.3), [12.0, 4.0])] {
         let direction = camera.direction(x, y);
-        for (got, expected) in rays[6 * token + 3..].iter().zip(direction) {
+        for (got, expected) in rays[6 * token + 3..].iter().zip(direction.to_array()) {
             assert!((f64::from(*got) - expected).abs() < 1e-7, "token {token}: {rays:?} against {direction:?}");
         }
-        assert_eq!(scene().token_rays()[token].origin, [3, 7, 11].map(|i| camera.c2w[i]));
+        assert_eq!(scene().token_rays()[token].origin, camera.c2w.translation);
     }
 }
 
@@ -244,14 +242,26 @@ fn invalid_tensor_values_are_refused() {
         (int8, "token_scales", 0, &(-1.0_f32).to_le_bytes(), "scale -1 of token 0"),
         (int8, "token_scales", 0, &f32::MAX.to_le_bytes(), "token 0 contains -inf"),
         (f32, "token_rays", 24 + 8, &f32_nan, "ray of token 1: "),
-        (f32, "context_c2w", 8 * 16, &f64_nan, "context camera 1: the pose contains NaN"),
-        (f32, "context_c2w", 0, &2.0_f64.to_le_bytes(), "context camera 0: the rotation differs from an orthonormal"),
-        (f32, "context_c2w", 8 * 15, &0.5_f64.to_le_bytes(), "context camera 0: last row [0.0, 0.0, 0.0, 0.5]"),
-        (f32, "context_c2w", 8 * 5, &(-1.0_f64).to_le_bytes(), "context camera 0: the rotation mirrors"),
-        (f32, "context_c2w", 8 * 7, &1e5_f64.to_le_bytes(), "context camera 0: position [-1.0, 100000.0"),
-        (f32, "context_intrinsics", 0, &f64_nan, "context camera 0: intrinsics [NaN"),
-        (f32, "context_intrinsics", 8, &(-20.0_f64).to_le_bytes(), "intrinsics [20.0, -20.0"),
-        (f32, "world_mean_c2w", 8, &f64_nan, "mean pose: the pose contains NaN"),
+        (f32, "context_c2w", 8 * 16, &f64_nan, "context camera 1: bad camera: the pose holds NaN"),
+        (
+            f32,
+            "context_c2w",
+            0,
+            &2.0_f64.to_le_bytes(),
+            "context camera 0: bad camera: the rotation is off an orthonormal",
+        ),
+        (
+            f32,
+            "context_c2w",
+            8 * 15,
+            &0.5_f64.to_le_bytes(),
+            "context camera 0: bad camera: the last row of the pose is [0.0, 0.0, 0.0, 0.5]",
+        ),
+        (f32, "context_c2w", 8 * 5, &(-1.0_f64).to_le_bytes(), "context camera 0: bad camera: the rotation mirrors"),
+        (f32, "context_c2w", 8 * 7, &1e5_f64.to_le_bytes(), "context camera 0: bad camera: the camera is 100000 times"),
+        (f32, "context_intrinsics", 0, &f64_nan, "context camera 0: bad camera: fx is NaN"),
+        (f32, "context_intrinsics", 8, &(-20.0_f64).to_le_bytes(), "context camera 0: bad camera: fy is -20"),
+        (f32, "world_mean_c2w", 8, &f64_nan, "mean pose: bad camera: the pose holds NaN"),
         (f32, "world_scale", 0, &f64_nan, "pose scale NaN"),
         (f32, "world_scale", 0, &0.0_f64.to_le_bytes(), "pose scale 0"),
         (f32, "token_ids", 4, &12_u32.to_le_bytes(), "token 1 of patch 12, expected less than 12"),
@@ -281,10 +291,10 @@ fn only_scene_files_are_overwritten() {
     #[cfg(unix)]
     std::os::unix::fs::symlink(folder.path(), folder.0.path().join("link.clift")).unwrap();
     for (name, expected) in [
-        ("model.safetensors", "the existing file is no scene, and only scenes are overwritten; choose another name"),
-        (".", "is no regular file"),
+        ("model.safetensors", "the existing file is not a scene, and only scenes are overwritten; choose another name"),
+        (".", "is not a regular file"),
         #[cfg(unix)]
-        ("link.clift", "is no regular file"),
+        ("link.clift", "is not a regular file"),
         ("no/room.clift", "no folder "),
         ("room.clift/room.clift", "no folder "),
     ] {

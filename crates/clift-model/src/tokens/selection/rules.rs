@@ -2,12 +2,12 @@
 
 use std::str::FromStr;
 
+use clift_core::{Camera, DVec3};
 use serde::Deserialize;
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
 use crate::names::parse_value;
-use crate::views::camera::ViewCamera;
 
 /// Side of a grid cell of the target view in pixels.
 const CELL_PX: f64 = 16.0;
@@ -104,7 +104,7 @@ impl SelectionRules {
     }
 
     /// Returns the unit directions through the cell centers, `[rows * columns]`; margin cells lie outside the image.
-    pub(crate) fn cell_directions(&self, camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
+    pub(crate) fn cell_directions(&self, camera: &Camera, height: usize, width: usize) -> Vec<DVec3> {
         let [rows, columns] = self.grid(height, width);
         let cell_px = self.cell_px(height, width);
         let center = |cell: usize| (cell as f64 - MARGIN_CELLS as f64 + 0.5) * cell_px;

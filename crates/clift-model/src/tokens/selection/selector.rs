@@ -4,12 +4,13 @@
 //! the previous frame belongs to a token and not to its view, and ties go to the lower id.
 // S stored tokens, R rendered tokens, Q cells of the target's grid
 
+use clift_core::{Camera, DVec3};
+use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::error::ModelError;
 use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::token_ray::TokenRay;
-use crate::views::camera::ViewCamera;
 
 /// Fewest cells per task.
 const CELLS_PER_TASK: usize = 16;
@@ -20,7 +21,7 @@ const GROUP: usize = 32;
 #[derive(Clone, Debug)]
 pub struct Selector {
     rules: SelectionRules,
-    origins: Vec<[f64; 3]>,
+    origins: Vec<DVec3>,
     directions: Directions,
     /// Rows and columns of the previous frame's grid.
     grid: [usize; 2],
@@ -29,7 +30,7 @@ pub struct Selector {
     /// Whether a token was selected for the previous frame; empty before the first frame.
     previous: Vec<bool>,
     /// Axis of the camera of the last frame.
-    last_axis: Option<[f64; 3]>,
+    last_axis: Option<DVec3>,
 }
 
 /// Unit directions, one array per coordinate for vectorization.
@@ -59,11 +60,12 @@ impl Selector {
     pub fn new(rules: SelectionRules, rays: &[TokenRay]) -> Result<Self, ModelError> {
         let mut directions = Directions { x: Vec::new(), y: Vec::new(), z: Vec::new() };
         for (token, ray) in rays.iter().enumerate() {
-            let length = ray.direction.iter().map(|v| v * v).sum::<f64>().sqrt();
-            if !(length > 0.0 && length.is_finite() && ray.origin.iter().all(|v| v.is_finite())) {
-                return Err(ModelError::BadRay { token, origin: ray.origin, direction: ray.direction });
+            let length = ray.direction.length();
+            if !(length > 0.0 && length.is_finite() && ray.origin.is_finite()) {
+                let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
+                return Err(ModelError::BadRay { token, origin, direction });
             }
-            let [x, y, z] = ray.direction.map(|v| (v / length) as f32);
+            let Vec3 { x, y, z } = (ray.direction / length).as_vec3();
             directions.x.push(x);
             directions.y.push(y);
             directions.z.push(z);
@@ -94,7 +96,7 @@ impl Selector {
     /// [`ModelError::BadConfig`] for zero tokens, [`ModelError::NotFinite`] for a camera that is not finite.
     pub fn select(
         &mut self,
-        camera: &ViewCamera,
+        camera: &Camera,
         height: usize,
         width: usize,
         num_render_tokens: usize,
@@ -104,15 +106,15 @@ impl Selector {
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: "0".into(), fix });
         }
         let cells = self.rules.cell_directions(camera, height, width);
-        let mut values = cells.iter().flatten().chain(camera.c2w.iter()).enumerate();
-        if let Some((position, &value)) = values.find(|(_, value)| !value.is_finite()) {
+        let values = cells.iter().flat_map(DVec3::to_array).chain(camera.c2w.to_matrix_f64());
+        if let Some((position, value)) = values.enumerate().find(|(_, value)| !value.is_finite()) {
             return Err(ModelError::NotFinite { name: "the target's camera", value: value as f32, position });
         }
         self.start_frame(camera, &cells, self.rules.grid(height, width));
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
-        let nearest = self.measure(&cells, self.rules.grid(height, width), camera.origin(), per_cell);
+        let nearest = self.measure(&cells, self.rules.grid(height, width), camera.c2w.translation, per_cell);
         let chosen = nearest.choose(num_render_tokens);
         self.previous = vec![false; num_storage_tokens];
         for &token in &chosen {
@@ -122,9 +124,9 @@ impl Selector {
     }
 
     /// Forgets the previous frame after a cut: if the camera turned by more than the angle of the central cell.
-    fn start_frame(&mut self, camera: &ViewCamera, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
-        let angle = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().clamp(-1.0, 1.0).acos();
-        let (axis, middle) = (camera.axis(), rows / 2 * columns + columns / 2);
+    fn start_frame(&mut self, camera: &Camera, cells: &[DVec3], [rows, columns]: [usize; 2]) {
+        let angle = |a: DVec3, b: DVec3| a.dot(b).clamp(-1.0, 1.0).acos();
+        let (axis, middle) = (camera.c2w.rotation.z_axis, rows / 2 * columns + columns / 2);
         let cell = angle(cells[middle], cells[middle - 1]);
         if self.rules.cuts && self.last_axis.is_some_and(|last| angle(last, axis) > cell) {
             self.reset();
@@ -133,7 +135,7 @@ impl Selector {
     }
 
     /// Updates the smoothed distances of all tokens to all cells and returns the nearest tokens.
-    fn measure(&mut self, cells: &[[f64; 3]], grid: [usize; 2], target: [f64; 3], per_cell: usize) -> Nearest {
+    fn measure(&mut self, cells: &[DVec3], grid: [usize; 2], target: DVec3, per_cell: usize) -> Nearest {
         let num_tokens = self.origins.len();
         let SelectionRules { momentum, .. } = self.rules;
         let offsets = self.offsets(target);
@@ -145,10 +147,10 @@ impl Selector {
             self.field = vec![row; cells.len()];
         }
         let directions = &self.directions;
-        let weigh = |mut found: Nearest, (cell, kept): (&[f64; 3], &mut Vec<f32>)| {
+        let weigh = |mut found: Nearest, (cell, kept): (&DVec3, &mut Vec<f32>)| {
             let mut scratch = std::mem::take(&mut found.row);
             let row = if keeps_field { kept } else { &mut scratch };
-            directions.add_distances(cell.map(|v| v as f32), &offsets, momentum, row);
+            directions.add_distances(cell.as_vec3(), &offsets, momentum, row);
             for (nearest, &distance) in found.distance.iter_mut().zip(row.iter()) {
                 *nearest = if distance < *nearest { distance } else { *nearest };
             }
@@ -162,12 +164,11 @@ impl Selector {
     }
 
     /// Returns the part of every token's distance that is equal for all cells.
-    fn offsets(&self, target: [f64; 3]) -> Vec<f32> {
+    fn offsets(&self, target: DVec3) -> Vec<f32> {
         let SelectionRules { distance_weight, previous_bonus, .. } = self.rules;
-        let offset = |(token, origin): (usize, &[f64; 3])| {
-            let between = origin.iter().zip(target).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        let offset = |(token, origin): (usize, &DVec3)| {
             let bonus = if self.previous.get(token) == Some(&true) { previous_bonus } else { 0.0 };
-            distance_weight * between as f32 - bonus
+            distance_weight * origin.distance(target) as f32 - bonus
         };
         self.origins.iter().enumerate().map(offset).collect()
     }
@@ -175,13 +176,13 @@ impl Selector {
 
 impl Directions {
     /// Replaces a row by `(1 - momentum) * (angle + offset) + momentum * row`.
-    fn add_distances(&self, cell: [f32; 3], offsets: &[f32], momentum: f32, row: &mut [f32]) {
+    fn add_distances(&self, cell: Vec3, offsets: &[f32], momentum: f32, row: &mut [f32]) {
         let Self { x, y, z } = self;
         let (count, keep) = (row.len(), 1.0 - momentum);
         // Slices of visibly equal length let the compiler omit bounds checks and vectorize.
         let (x, y, z, offsets) = (&x[..count], &y[..count], &z[..count], &offsets[..count]);
         for i in 0..count {
-            let (dx, dy, dz) = (x[i] - cell[0], y[i] - cell[1], z[i] - cell[2]);
+            let (dx, dy, dz) = (x[i] - cell.x, y[i] - cell.y, z[i] - cell.z);
             let distance = angle(dx * dx + dy * dy + dz * dz) + offsets[i];
             row[i] = keep * distance + momentum * row[i];
         }

@@ -1,14 +1,14 @@
 //! The ray of a stored token.
 
-use crate::views::camera::ViewCamera;
+use clift_core::{Camera, DVec3};
 
 /// The ray through the center of a token's patch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TokenRay {
     /// Center of the camera of the token's view.
-    pub origin: [f64; 3],
+    pub origin: DVec3,
     /// Direction, of any length but zero.
-    pub direction: [f64; 3],
+    pub direction: DVec3,
 }
 
 impl TokenRay {
@@ -17,21 +17,21 @@ impl TokenRay {
     ///
     /// # Panics
     /// If a view is out of range.
-    pub fn of_patches(
-        ids: &[u32],
-        context: &[ViewCamera],
-        height: usize,
-        width: usize,
-        patch_size: usize,
-    ) -> Vec<Self> {
+    pub fn of_patches(ids: &[u32], context: &[Camera], height: usize, width: usize, patch_size: usize) -> Vec<Self> {
         let [rows, columns] = [height, width].map(|side| side / patch_size);
         let center = |patch: usize| (patch as f64 + 0.5) * patch_size as f64;
         let ray = |&id: &u32| {
             let id = id as usize;
             let camera = &context[id / (rows * columns)];
             let direction = camera.direction(center(id % columns), center(id / columns % rows));
-            Self { origin: camera.origin(), direction }
+            Self { origin: camera.c2w.translation, direction }
         };
         ids.iter().map(ray).collect()
+    }
+
+    /// Returns `[moment, direction]`.
+    pub(crate) fn plucker(&self) -> [f64; 6] {
+        let ([a, b, c], [x, y, z]) = (self.origin.cross(self.direction).to_array(), self.direction.to_array());
+        [a, b, c, x, y, z]
     }
 }

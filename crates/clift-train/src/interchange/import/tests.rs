@@ -287,7 +287,7 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     let whole = std::fs::read(fixture("checkpoints/re10k.ckpt")).unwrap();
     for length in [0, 1, 1000, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&file, &whole[..length]).unwrap();
-        let what = if length == 0 { "an empty file" } else { "is no readable ZIP archive" };
+        let what = if length == 0 { "an empty file" } else { "is not a readable ZIP archive" };
         assert_says(&refused(&file, place.path(), &re10k()), &["bad checkpoint: ", what]);
     }
     // A flipped bit of a weight is found by the archive's checksum.

@@ -203,10 +203,12 @@ fn first_batches_have_half_the_resolution_and_the_same_views() {
             assert_eq!(clip.key, whole.key);
             for (views, whole) in [(&clip.context, &whole.context), (&clip.target, &whole.target)] {
                 assert_eq!((views.width, views.height), (16 / divisor, 16 / divisor), "step {step}");
-                assert_eq!((&views.frame_index, &views.c2w), (&whole.frame_index, &whole.c2w));
-                let [k, whole] = [views, whole].map(|views| views.intrinsics[0]);
-                let k = [k.fx, k.fy, k.cx, k.cy].map(|pixels| pixels * divisor as f64);
-                assert_eq!(k, [whole.fx, whole.fy, whole.cx, whole.cy]);
+                assert_eq!(views.frame_index, whole.frame_index);
+                for (camera, whole) in views.cameras.iter().zip(&whole.cameras) {
+                    assert_eq!(camera.c2w, whole.c2w);
+                    let pixels = camera.intrinsics.to_array().map(|pixels| pixels * divisor as f64);
+                    assert_eq!(pixels, whole.intrinsics.to_array());
+                }
             }
         }
         // Ids of tokens that exist: one patch of 8 pixels for each of two views, or four.

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use clift_bench::{Throughput, ThroughputOptions, measure_reading};
-use clift_data::{ClipOptions, FileOptions, PoseRotation, PoseScale};
+use clift_core::{PoseRotation, PoseScale};
+use clift_data::{ClipOptions, FileOptions};
 use clift_eval::{peak_bytes, start_peak, table};
 use serde::Serialize;
 

@@ -166,7 +166,8 @@ pub struct InfoArgs {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{RgbImage, encode_png};
+    use clift_core::RgbImage;
+    use clift_data::encode_png;
 
     use super::*;
 

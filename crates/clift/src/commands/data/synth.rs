@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
+use clift_core::{TEMPORARY, publish_folder};
 use clift_data::{
-    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, TEMPORARY,
-    plural, publish_folder, read_scene, write_chunks, write_evaluation_index,
+    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, plural,
+    read_scene, write_chunks, write_evaluation_index,
 };
 use clift_eval::EvalConfig;
 use clift_model::ModelConfig;
@@ -35,7 +36,7 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     if size != [width, height] && width > 0 && height > 0 {
         let (size, patch) = (format!("{}x{}", size[0], size[1]), patch_size());
         print_warning(format!(
-            "{size} is no multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
+            "{size} is not a multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
         ));
     }
     for &split in args.split.list() {

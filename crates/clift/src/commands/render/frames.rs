@@ -4,9 +4,9 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
-use clift_data::{is_empty_folder, median};
+use clift_core::{Camera, is_empty_folder, median};
 use clift_eval::{Animation, Canvas, Video};
-use clift_model::{SceneRenderer, ViewCamera};
+use clift_model::SceneRenderer;
 use clift_train::TrainError;
 use serde::Serialize;
 
@@ -73,7 +73,7 @@ pub fn remove_later_frames(out: &Path, num_frames: usize) -> std::io::Result<()>
 /// Renders every view and writes the frames and the animation to `folder`, until `stop` is set.
 pub fn write_frames(
     renderer: &mut SceneRenderer,
-    views: &[ViewCamera],
+    views: &[Camera],
     frames: &Frames<'_>,
     folder: &Path,
     stop: &AtomicBool,

@@ -4,13 +4,12 @@ use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::{
-    Intrinsics, PathView, Pose, PoseNormalization, StagedDir, interpolate_path, mean_intrinsics, orbit_path, read_poses,
-};
+use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_path};
+use clift_data::read_poses;
 use clift_eval::available_bytes;
 use clift_model::{
     DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, RenderBudget, Scene,
-    SceneRenderer, ViewCamera, frame_bytes, frames_per_call, load_renderer,
+    SceneRenderer, frame_bytes, frames_per_call, load_renderer,
 };
 use serde::Serialize;
 
@@ -158,7 +157,7 @@ fn token_count(
     scene: &Scene,
     args: &RenderArgs,
     renderer: &mut SceneRenderer,
-    view: &ViewCamera,
+    view: &Camera,
     height: usize,
     width: usize,
 ) -> anyhow::Result<(usize, Option<RenderBudget>)> {
@@ -183,13 +182,9 @@ fn token_count(
 }
 
 /// Returns the cameras of the path, with intrinsics in pixels of the frames.
-fn path_cameras(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -> anyhow::Result<Vec<ViewCamera>> {
-    let context = scene.context.iter().map(|view| {
-        let ViewCamera { c2w, intrinsics: [fx, fy, cx, cy] } =
-            view.resized([scene.height, scene.width], [height, width]);
-        Ok(PathView { c2w: Pose::from_matrix(&c2w)?, intrinsics: Intrinsics { fx, fy, cx, cy } })
-    });
-    let context = context.collect::<anyhow::Result<Vec<_>>>()?;
+fn path_cameras(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -> anyhow::Result<Vec<Camera>> {
+    let resized = |camera: &Camera| camera.resized([scene.height, scene.width], [height, width]);
+    let context: Vec<Camera> = scene.context.iter().map(resized).collect();
     let views = match &args.path {
         CameraPath::Interpolate => interpolate_path(&context, args.frames.unwrap_or(DEFAULT_FRAMES)),
         CameraPath::Orbit => orbit_path(&context, args.frames.unwrap_or(DEFAULT_FRAMES)),
@@ -203,17 +198,10 @@ fn path_cameras(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -
             if args.frames.is_some() {
                 usage_bail!("a file of poses determines the number of frames; remove --frames");
             }
-            let mean_c2w = Pose::from_matrix(&scene.world.mean_c2w)?;
-            let frame = PoseNormalization { mean_c2w, scale: scene.world.scale };
             let default = mean_intrinsics(&context).context("the scene has no context views")?;
-            read_poses(file, &frame, default, width, height)?
+            read_poses(file, &scene.world, default, width, height)?
         }
     };
-    let camera = |view: &PathView| {
-        let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
-        ViewCamera { c2w: view.c2w.to_matrix_f64(), intrinsics: [fx, fy, cx, cy] }
-    };
-    let views: Vec<ViewCamera> = views.iter().map(camera).collect();
     if views.is_empty() {
         let fix = "write at least 1".into();
         return Err(ModelError::BadConfig { key: "frames", value: "0".into(), fix }.into());

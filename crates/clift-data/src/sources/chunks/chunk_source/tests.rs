@@ -229,7 +229,7 @@ fn shared_values_cannot_fill_the_memory() {
     assert!(message(&scenes).unwrap_err().contains("more than the limit of 16777216 bytes"));
 }
 
-/// Writes `num_chunks` chunks of `num_scenes` scenes each; frames are no images.
+/// Writes `num_chunks` chunks of `num_scenes` scenes each; frames are not images.
 fn write_made_up(folder: &Path, num_chunks: usize, num_scenes: usize, num_frames: usize) {
     let cameras = re10k_mini(Split::Train).cameras(0).unwrap();
     let mut index = BTreeMap::new();

@@ -2,12 +2,11 @@
 
 use std::collections::HashMap;
 
+use clift_core::{Intrinsics, IntrinsicsNorm, Pose};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::error::DataError;
-use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
-use crate::geometry::pose::Pose;
 use crate::sources::photos::photo::MAX_FRAMES;
 
 /// Largest number of cameras of a model: one per image.
@@ -80,7 +79,7 @@ pub(crate) struct ColmapImage {
 
 impl ColmapImage {
     pub fn c2w(&self) -> Result<Pose, DataError> {
-        let bad = |what: String| DataError::BadCamera { what };
+        let bad = DataError::bad_camera;
         if let Some(value) = self.w2c.iter().find(|value| !value.is_finite()) {
             return Err(bad(format!("the pose holds {value}")));
         }

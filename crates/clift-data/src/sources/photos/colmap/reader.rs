@@ -58,7 +58,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         };
         let in_frame = |error| PhotoScene::in_frame(&images_path, &image.name)(error);
         let Some((intrinsics_norm, lens)) = optics.get(&image.camera_id) else {
-            return Err(in_frame(DataError::BadCamera { what: format!("no camera {}", image.camera_id) }));
+            return Err(in_frame(DataError::bad_camera(format!("no camera {}", image.camera_id))));
         };
         let camera = &cameras[&image.camera_id];
         let size = Some([camera.width as f64, camera.height as f64]);

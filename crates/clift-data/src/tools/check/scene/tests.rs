@@ -2,18 +2,17 @@
 
 use std::sync::OnceLock;
 
+use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::*;
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
 use crate::testing;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, Verdict};
 
 struct RenderedRoom {
-    cameras: Vec<Camera>,
+    cameras: Vec<Camera<IntrinsicsNorm>>,
     frames: Vec<RgbImage>,
 }
 
@@ -41,7 +40,7 @@ struct Changed<C, F> {
 
 impl<C, F> SceneSource for Changed<C, F>
 where
-    C: Fn(usize, &mut Camera) + Send + Sync,
+    C: Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync,
     F: Fn(usize) -> usize + Send + Sync,
 {
     fn num_scenes(&self) -> usize {
@@ -56,7 +55,7 @@ where
         None
     }
 
-    fn cameras(&self, _scene: usize) -> Result<Vec<Camera>, DataError> {
+    fn cameras(&self, _scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let mut cameras = self.room.cameras.clone();
         cameras.iter_mut().enumerate().for_each(|(frame, camera)| (self.cameras)(frame, camera));
         Ok(cameras)
@@ -70,7 +69,7 @@ where
     }
 }
 
-fn check(cameras: impl Fn(usize, &mut Camera) + Send + Sync) -> SceneCheck {
+fn check(cameras: impl Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync) -> SceneCheck {
     check_scene(&Changed { room: &rooms()[0], cameras, frame: |frame| frame }, 0).check
 }
 
@@ -105,7 +104,7 @@ fn cameras_that_contradict_the_images_fail() {
     let opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     flagged("OpenGL axes", check(|_, camera| camera.c2w.rotation *= opengl));
     flagged("world to camera", check(|_, camera| camera.c2w = camera.c2w.inverse()));
-    flagged("focal length of another camera", check(|_, camera| camera.intrinsics_norm.fx *= 1.25));
+    flagged("focal length of another camera", check(|_, camera| camera.intrinsics.fx *= 1.25));
     let shuffled = Changed { room: &rooms()[0], cameras: |_, _: &mut _| (), frame: |frame| (frame * 5 + 2) % 12 };
     flagged("frames of other cameras", check_scene(&shuffled, 0).check);
 }
@@ -120,15 +119,15 @@ fn usual_mistakes_are_named() {
     let opposite = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     named(check(|_, camera| camera.c2w.rotation *= opposite), "the y and z axes of every camera reversed");
     named(check(|_, camera| camera.c2w = camera.c2w.inverse()), "every pose inverted (");
-    let view_matrix = |_: usize, camera: &mut Camera| {
+    let view_matrix = |_: usize, camera: &mut Camera<IntrinsicsNorm>| {
         camera.c2w.rotation *= opposite;
         camera.c2w = camera.c2w.inverse();
     };
     named(check(view_matrix), "every pose inverted, then its y and z axes reversed");
     for (scale, expected) in [(1.1, "focal lengths times 0.9"), (0.9, "focal lengths times 1.1")] {
-        let scaled = move |_: usize, camera: &mut Camera| {
-            camera.intrinsics_norm.fx *= scale;
-            camera.intrinsics_norm.fy *= scale;
+        let scaled = move |_: usize, camera: &mut Camera<IntrinsicsNorm>| {
+            camera.intrinsics.fx *= scale;
+            camera.intrinsics.fy *= scale;
         };
         named(check(scaled), expected);
     }
@@ -171,15 +170,15 @@ fn implausible_cameras_fail_with_the_reason() {
         assert_eq!(check.verdict, Verdict::Flagged);
         check.reasons.join("; ")
     };
-    let text = reasons(check(|_, camera| camera.intrinsics_norm.cx = 0.9));
+    let text = reasons(check(|_, camera| camera.intrinsics.cx = 0.9));
     assert!(text.contains("principal point at (0.900, 0.500) of the image in 12 frames (0, 1, 2, 3, 4, ..)"), "{text}");
     let text = reasons(check(|frame, camera| {
         if frame == 3 {
-            camera.intrinsics_norm.fx = 0.2;
+            camera.intrinsics.fx = 0.2;
         }
     }));
     assert!(text.contains("degrees in 1 frame (3), expected 5 to 120"), "{text}");
-    let text = reasons(check(|_, camera| camera.intrinsics_norm.fy *= 2.0));
+    let text = reasons(check(|_, camera| camera.intrinsics.fy *= 2.0));
     assert!(text.contains("fx / fy = 0.500: the intrinsics may belong to another image size"), "{text}");
     let text = reasons(check(|frame, camera| camera.c2w.rotation.x_axis.x += 0.004 * f64::from(frame == 5)));
     assert!(text.contains("depart from orthonormal ones by up to"), "{text}");
@@ -192,7 +191,7 @@ fn repeated_and_unreadable_frames_are_reported() {
     let source = testing::rooms(|c| (c.num_frames, c.width, c.height) = (8, 48, 32));
     let frames = (0..8).map(|frame| source.frame(0, frame).unwrap()).collect();
     let room: &'static RenderedRoom = Box::leak(Box::new(RenderedRoom { cameras: source.cameras(0).unwrap(), frames }));
-    let of = |frame: fn(usize) -> usize, cameras: fn(usize, &mut Camera)| {
+    let of = |frame: fn(usize) -> usize, cameras: fn(usize, &mut Camera<IntrinsicsNorm>)| {
         check_scene(&Changed { room, cameras, frame }, 0).check
     };
     let stuck = of(|frame| frame.min(5), |_, _| ());

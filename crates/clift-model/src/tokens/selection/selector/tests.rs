@@ -1,5 +1,6 @@
 //! Selection against brute force in f64, edge cases, and properties.
 
+use clift_core::{DMat3, Intrinsics, Pose};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -8,22 +9,18 @@ use super::*;
 use crate::tokens::selection::rules::SelectionPreset;
 
 /// Returns a camera at `origin`, rotated by `angle` about the y axis, for an image of 64 x 64.
-fn camera(origin: [f64; 3], angle: f64) -> ViewCamera {
-    let (sin, cos) = angle.sin_cos();
-    let [x, y, z] = origin;
-    ViewCamera {
-        c2w: [cos, 0.0, sin, x, 0.0, 1.0, 0.0, y, -sin, 0.0, cos, z, 0.0, 0.0, 0.0, 1.0],
-        intrinsics: [60.0, 60.0, 32.0, 32.0],
-    }
+fn camera(origin: [f64; 3], angle: f64) -> Camera {
+    let c2w = Pose { rotation: DMat3::from_rotation_y(angle), translation: origin.into() };
+    Camera { c2w, intrinsics: Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 } }
 }
 
 /// Samples tokens of four views, with directions to the front.
 fn random_rays(count: usize, seed: u64) -> Vec<TokenRay> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut number = |most: f64| rng.random_range(-most..most);
-    let origins: Vec<[f64; 3]> = (0..4).map(|_| [number(1.0), number(0.3), number(0.5)]).collect();
+    let origins: Vec<DVec3> = (0..4).map(|_| DVec3::new(number(1.0), number(0.3), number(0.5))).collect();
     (0..count)
-        .map(|token| TokenRay { origin: origins[token % 4], direction: [number(1.0), number(1.0), 1.0] })
+        .map(|token| TokenRay { origin: origins[token % 4], direction: DVec3::new(number(1.0), number(1.0), 1.0) })
         .collect()
 }
 
@@ -32,36 +29,34 @@ struct BruteForce {
     rules: SelectionRules,
     rays: Vec<TokenRay>,
     frames: Vec<(Vec<Vec<f64>>, Vec<usize>)>,
-    last_axis: Option<[f64; 3]>,
+    last_axis: Option<DVec3>,
     grid: [usize; 2],
 }
 
 impl BruteForce {
-    fn select(&mut self, camera: &ViewCamera, height: usize, width: usize, count: usize) -> Vec<u32> {
+    fn select(&mut self, camera: &Camera, height: usize, width: usize, count: usize) -> Vec<u32> {
         let rules = self.rules;
         let count = count.min(self.rays.len());
         let side = if rules.scaled_cells { height.min(width) as f64 / 16.0 } else { 16.0 };
         let [rows, columns] = [height, width].map(|pixels| (pixels as f64 / side).ceil() as usize + 8);
-        let cells: Vec<[f64; 3]> = (0..rows * columns)
+        let cells: Vec<DVec3> = (0..rows * columns)
             .map(|cell| {
                 let pixel = |index: usize| (index as f64 - 4.0 + 0.5) * side;
                 camera.direction(pixel(cell % columns), pixel(cell / columns))
             })
             .collect();
-        let axis = camera.axis();
-        let turned =
-            self.last_axis.map(|last: [f64; 3]| last.iter().zip(axis).map(|(a, b)| a * b).sum::<f64>().min(1.0).acos());
-        if rules.cuts && turned.is_some_and(|turned| turned > (side / camera.intrinsics[0]).atan()) {
+        let axis = camera.c2w.rotation.z_axis;
+        let turned = self.last_axis.map(|last| last.dot(axis).min(1.0).acos());
+        if rules.cuts && turned.is_some_and(|turned| turned > (side / camera.intrinsics.fx).atan()) {
             self.frames.clear();
         }
         self.last_axis = Some(axis);
-        let unit = |v: [f64; 3]| v.map(|x| x / v.iter().map(|x| x * x).sum::<f64>().sqrt());
         let mut field = vec![vec![0.0; self.rays.len()]; cells.len()];
         for (q, cell) in cells.iter().enumerate() {
             for (s, ray) in self.rays.iter().enumerate() {
-                let cosine: f64 = unit(ray.direction).iter().zip(cell).map(|(a, b)| a * b).sum();
-                let apart: f64 = ray.origin.iter().zip(camera.origin()).map(|(a, b)| (a - b).powi(2)).sum();
-                let mut distance = cosine.clamp(-1.0, 1.0).acos() + f64::from(rules.distance_weight) * apart.sqrt();
+                let cosine = ray.direction.normalize().dot(*cell);
+                let apart = ray.origin.distance(camera.c2w.translation);
+                let mut distance = cosine.clamp(-1.0, 1.0).acos() + f64::from(rules.distance_weight) * apart;
                 if let Some((previous, chosen)) = self.frames.last() {
                     if chosen.contains(&s) {
                         distance -= f64::from(rules.previous_bonus);
@@ -138,7 +133,7 @@ fn frames_equal_brute_force_for_0_to_7_tokens_per_cell() {
 
 #[test]
 fn ties_go_to_the_lower_ids() {
-    let ray = TokenRay { origin: [0.1, 0.2, 0.3], direction: [0.0, 0.1, 1.0] };
+    let ray = TokenRay { origin: DVec3::new(0.1, 0.2, 0.3), direction: DVec3::new(0.0, 0.1, 1.0) };
     for &preset in SelectionPreset::ALL {
         let mut selector = Selector::new(preset.rules(), &[ray; 300]).unwrap();
         for count in [1, 7, 81, 170, 299] {
@@ -151,8 +146,7 @@ fn ties_go_to_the_lower_ids() {
 
 #[test]
 fn camera_distance_has_weight_one_fiftieth() {
-    let direction = [0.0, 0.0, 1.0];
-    let rays = [TokenRay { origin: [1.0, 0.0, 0.0], direction }, TokenRay { origin: [0.0, 0.2, 0.0], direction }];
+    let rays = [DVec3::X, 0.2 * DVec3::Y].map(|origin| TokenRay { origin, direction: DVec3::Z });
     let mut selector = Selector::new(SelectionPreset::Global.rules(), &rays).unwrap();
     assert_eq!(selector.select(&camera([0.0; 3], 0.0), 16, 16, 1).unwrap(), [1]);
     assert_eq!(selector.select(&camera([0.9, 0.0, 0.0], 0.0), 16, 16, 1).unwrap(), [0]);
@@ -167,7 +161,7 @@ fn zero_tokens_and_non_finite_inputs_are_refused() {
     let message = selector.select(&camera([f64::NAN, 0.0, 0.0], 0.0), 16, 16, 1).unwrap_err().to_string();
     assert!(message.starts_with("the target's camera holds NaN"), "{message}");
     for direction in [[0.0; 3], [f64::NAN, 0.0, 1.0], [f64::INFINITY, 0.0, 1.0]] {
-        let rays = [rays[0], TokenRay { direction, ..rays[1] }];
+        let rays = [rays[0], TokenRay { direction: direction.into(), ..rays[1] }];
         let message = Selector::new(SelectionRules::PAPER, &rays).unwrap_err().to_string();
         assert!(message.starts_with("invalid ray of token 1"), "{message}");
     }

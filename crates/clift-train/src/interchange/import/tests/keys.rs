@@ -17,7 +17,7 @@ fn missing_and_unknown_keys_list_nearest_names() {
     assert_says(
         &message,
         &[
-            "the checkpoint is no released-re10k network (width 15, 3 heads, 1 + 2 layers); no files were written",
+            "the checkpoint is not a released-re10k network (width 15, 3 heads, 1 + 2 layers); no files were written",
             "missing: transformer.encoder.layers.0.norm1.weight [15]; nearest name: transformer.encoder.layers.0.norm_1.weight",
             "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: transformer.encoder.layers.0.norm1.weight",
             "unknown: transformer.extra.deep.bias [2]; nearest name: transformer.",

@@ -26,6 +26,20 @@ pub fn replace_file(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     sync_folder(folder)
 }
 
+/// Renames the finished file `temporary` to `path`, with the permissions that a new file would have.
+///
+/// # Errors
+/// Errors of the operating system.
+pub fn publish_file(temporary: &Path, path: &Path) -> std::io::Result<()> {
+    // Windows syncs only files that are open for writing.
+    let file = File::options().write(true).open(temporary)?;
+    let usual = File::create(temporary.with_extension("usual"))?.metadata()?.permissions();
+    file.set_permissions(usual)?;
+    file.sync_all()?;
+    std::fs::rename(temporary, path)?;
+    sync_folder(folder_of(path))
+}
+
 /// Renames the finished folder `temporary` to `path`, which must not exist, after syncing its files. Subfolders are not
 /// allowed.
 ///
@@ -66,7 +80,7 @@ pub fn remove_folder(path: &Path) -> std::io::Result<()> {
 }
 
 /// Removes the temporary files and folders that killed processes left in `folder` and below it. No other process may
-/// write there. A missing folder is no error.
+/// write there. A missing folder is not an error.
 ///
 /// # Errors
 /// Errors of the operating system.
@@ -100,7 +114,8 @@ pub fn sync_folder(folder: &Path) -> std::io::Result<()> {
     }
 }
 
-fn folder_of(path: &Path) -> &Path {
+/// Returns the folder of a file: `.` for a bare name.
+pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 

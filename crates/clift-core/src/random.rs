@@ -36,12 +36,12 @@ pub fn uniform_below(rng: &mut impl Rng, count: usize) -> usize {
 }
 
 /// Samples uniformly from `low..=high`.
-pub(crate) fn uniform_between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
+pub fn uniform_between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
     low + uniform_below(rng, high - low + 1)
 }
 
 /// Samples uniformly from `[0, 1)`, in steps of `2^-53`.
-pub(crate) fn uniform_01(rng: &mut impl Rng) -> f64 {
+pub fn uniform_01(rng: &mut impl Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
 }
 
@@ -57,7 +57,7 @@ pub fn sample_distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<us
 }
 
 /// Samples `count` of `values` without replacement, in random order.
-pub(crate) fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> Vec<usize> {
+pub fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> Vec<usize> {
     for i in 0..count {
         let j = uniform_between(rng, i, values.len() - 1);
         values.swap(i, j);
@@ -81,7 +81,7 @@ fn purpose_tag(purpose: &str) -> u64 {
 }
 
 /// Mixes 64 bits with the finaliser of `SplitMix64`, a bijection.
-pub(crate) fn mix(value: u64) -> u64 {
+pub fn mix(value: u64) -> u64 {
     let value = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let value = (value ^ (value >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let value = (value ^ (value >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

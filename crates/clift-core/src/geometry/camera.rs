@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::error::DataError;
+use crate::error::CameraError;
 use crate::geometry::pose::Pose;
 
 /// Pinhole intrinsics in pixels of one image. The centre of the pixel in column `i` and row `j` is
@@ -32,24 +32,53 @@ pub struct IntrinsicsNorm {
     pub cy: f64,
 }
 
-impl IntrinsicsNorm {
+impl Intrinsics {
+    /// Returns `fx, fy, cx, cy`.
+    pub fn to_array(self) -> [f64; 4] {
+        let Self { fx, fy, cx, cy } = self;
+        [fx, fy, cx, cy]
+    }
+
     /// Checks that focal lengths are positive and all numbers finite.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] with the first number that fails.
-    pub fn validate(self) -> Result<(), DataError> {
+    /// [`CameraError::BadCamera`] with the first number that fails.
+    pub fn validate(self) -> Result<(), CameraError> {
         let Self { fx, fy, cx, cy } = self;
         for (name, focal) in [("fx", fx), ("fy", fy)] {
             if !(focal.is_finite() && focal > 0.0) {
-                return Err(DataError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
+                return Err(CameraError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
             }
         }
         for (name, centre) in [("cx", cx), ("cy", cy)] {
             if !centre.is_finite() {
-                return Err(DataError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
+                return Err(CameraError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
             }
         }
         Ok(())
+    }
+}
+
+impl From<[f64; 4]> for Intrinsics {
+    /// Converts `fx, fy, cx, cy`.
+    fn from([fx, fy, cx, cy]: [f64; 4]) -> Self {
+        Self { fx, fy, cx, cy }
+    }
+}
+
+impl IntrinsicsNorm {
+    /// Returns `fx, fy, cx, cy`.
+    pub fn to_array(self) -> [f64; 4] {
+        let Self { fx, fy, cx, cy } = self;
+        [fx, fy, cx, cy]
+    }
+
+    /// Checks that focal lengths are positive and all numbers finite.
+    ///
+    /// # Errors
+    /// [`CameraError::BadCamera`] with the first number that fails.
+    pub fn validate(self) -> Result<(), CameraError> {
+        Intrinsics::from(self.to_array()).validate()
     }
 
     /// Divides `intrinsics` in pixels by the size of their image, in pixels.
@@ -65,34 +94,62 @@ impl IntrinsicsNorm {
     }
 }
 
-/// A pinhole camera in the world of its scene, as stored in files.
+/// A posed pinhole camera, OpenCV axes: with intrinsics in pixels of its image, or `Camera<IntrinsicsNorm>` of an image of
+/// any size, as data sets have it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Camera {
-    /// Intrinsics over width and height.
-    pub intrinsics_norm: IntrinsicsNorm,
-    /// Camera-to-world pose, OpenCV axes.
+pub struct Camera<K = Intrinsics> {
+    /// Camera-to-world pose.
     pub c2w: Pose,
+    /// Intrinsics.
+    pub intrinsics: K,
 }
 
 impl Camera {
+    /// Returns the unit direction in the world through column `x` and row `y` of the image, in pixels.
+    pub fn direction(&self, x: f64, y: f64) -> DVec3 {
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        let ray = DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0);
+        self.c2w.rotation * ray / ray.length()
+    }
+
+    /// Returns the camera for an image of another size. Focal lengths scale with the height, which preserves the vertical
+    /// field of view; the offset of the principal point from the image centre scales likewise.
+    ///
+    /// `from` and `to` are `[height, width]` in pixels.
+    #[must_use]
+    pub fn resized(&self, from: [usize; 2], to: [usize; 2]) -> Self {
+        let [from_height, from_width] = from.map(|side| side as f64);
+        let [height, width] = to.map(|side| side as f64);
+        let scale = height / from_height;
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        let intrinsics = Intrinsics {
+            fx: fx * scale,
+            fy: fy * scale,
+            cx: (cx - from_width / 2.0) * scale + width / 2.0,
+            cy: (cy - from_height / 2.0) * scale + height / 2.0,
+        };
+        Self { intrinsics, ..*self }
+    }
+}
+
+impl Camera<IntrinsicsNorm> {
     /// Converts the 18 numbers of a RealEstate10K frame: `fx fy cx cy` over width and height, two placeholders
     /// (ignored), then `w2c` as 3 x 4, row-major, OpenCV axes. `c2w` is the matrix inverse of `w2c`.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
-    pub fn from_re10k(row: [f64; 18]) -> Result<Self, DataError> {
+    /// [`CameraError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
+    pub fn from_re10k(row: [f64; 18]) -> Result<Self, CameraError> {
         let [fx, fy, cx, cy, ..] = row;
-        let intrinsics_norm = IntrinsicsNorm { fx, fy, cx, cy };
-        intrinsics_norm.validate()?;
+        let intrinsics = IntrinsicsNorm { fx, fy, cx, cy };
+        intrinsics.validate()?;
         let w2c = Pose::from_rows(&[0, 1, 2].map(|r| [0, 1, 2, 3].map(|c| row[6 + 4 * r + c])))?;
-        Ok(Self { intrinsics_norm, c2w: w2c.matrix_inverse() })
+        Ok(Self { intrinsics, c2w: w2c.matrix_inverse() })
     }
 
     /// Returns the 18 numbers that [`Camera::from_re10k`] reads, with zeros for the placeholders.
     pub fn to_re10k(&self) -> [f64; 18] {
-        let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics_norm;
         let mut row = [0.0; 18];
-        row[..4].copy_from_slice(&[fx, fy, cx, cy]);
+        row[..4].copy_from_slice(&self.intrinsics.to_array());
         row[6..].copy_from_slice(&self.c2w.matrix_inverse().to_matrix_f64()[..12]);
         row
     }
@@ -100,14 +157,14 @@ impl Camera {
     /// Returns the horizontal and the vertical field of view in degrees: the angles between the rays through the
     /// midpoints of opposite image edges, as pixelSplat's filter computes them.
     pub fn fov_deg(&self) -> (f64, f64) {
-        let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics_norm;
+        let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics;
         let ray = |u: f64, v: f64| DVec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
         (angle_deg(ray(0.0, 0.5), ray(1.0, 0.5)), angle_deg(ray(0.5, 0.0), ray(0.5, 1.0)))
     }
 }
 
 /// Returns the largest field of view of the cameras along either axis, in degrees; 0 for no cameras.
-pub(crate) fn widest_fov_deg(cameras: &[Camera]) -> f64 {
+pub fn widest_fov_deg(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
     cameras.iter().map(Camera::fov_deg).fold(0.0, |widest, (x, y)| widest.max(x).max(y))
 }
 
@@ -118,6 +175,8 @@ fn angle_deg(a: DVec3, b: DVec3) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use glam::DMat3;
+
     use super::*;
 
     /// Row of a camera at (1, 2, 3) that looks along world +x: its right is world -z, its down is world +y.
@@ -132,11 +191,11 @@ mod tests {
     #[test]
     fn re10k_row_matches_the_camera_computed_by_hand() {
         let camera = Camera::from_re10k(LOOKS_ALONG_X).unwrap();
-        assert_eq!(camera.intrinsics_norm, IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.25 });
+        assert_eq!(camera.intrinsics, IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.25 });
         assert_eq!(camera.c2w.translation, DVec3::new(1.0, 2.0, 3.0));
         assert_eq!(camera.c2w.rotation.z_axis, DVec3::X);
         assert_eq!(camera.c2w.rotation.x_axis, -DVec3::Z);
-        let pixels = camera.intrinsics_norm.to_pixels(640, 360);
+        let pixels = camera.intrinsics.to_pixels(640, 360);
         assert_eq!(pixels, Intrinsics { fx: 576.0, fy: 576.0, cx: 320.0, cy: 90.0 });
     }
 
@@ -173,5 +232,22 @@ mod tests {
         assert_eq!(message(9, f64::NEG_INFINITY), "bad camera: the pose holds -inf");
         assert!(message(11, -1.0).contains("mirrors"), "{}", message(11, -1.0));
         assert!(message(11, 2.0).contains("off an orthonormal one by 3.000e0"), "{}", message(11, 2.0));
+    }
+
+    /// Returns a camera at (0.5, -0.2, 0.1), rotated by 0.3 about y.
+    fn turned() -> Camera {
+        let c2w = Pose { rotation: DMat3::from_rotation_y(0.3), translation: DVec3::new(0.5, -0.2, 0.1) };
+        Camera { c2w, intrinsics: Intrinsics { fx: 20.0, fy: 22.0, cx: 8.5, cy: 4.0 } }
+    }
+
+    #[test]
+    fn resizing_preserves_the_vertical_field_of_view() {
+        let large = turned().resized([8, 16], [16, 48]);
+        assert_eq!(large.intrinsics, Intrinsics { fx: 40.0, fy: 44.0, cx: 25.0, cy: 8.0 });
+        assert_eq!(turned().resized([8, 16], [8, 16]), turned());
+        for (small_y, large_y) in [(0.0, 0.0), (8.0, 16.0)] {
+            let (a, b) = (turned().direction(8.0, small_y), large.direction(24.0, large_y));
+            assert!(a.abs_diff_eq(b, 1e-12), "{a} {b}");
+        }
     }
 }

@@ -3,10 +3,10 @@
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::error::DataError;
+use crate::error::CameraError;
 use crate::geometry::pose::{Pose, unit_quaternion};
 
-/// How the mean orientation of the context cameras is computed.
+/// Definition of the mean orientation of the context cameras.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PoseRotation {
@@ -50,10 +50,10 @@ impl PoseNormalization {
     /// Computes the frame of the camera-to-world poses `context`. `target` is used for [`PoseScale::All`] only.
     ///
     /// # Errors
-    /// - [`DataError::InFrame`] around [`DataError::BadCamera`] for a pose that is not finite; its frame is the position
+    /// - [`CameraError::InFrame`] around [`CameraError::BadCamera`] for a pose that is not finite; its frame is the position
     ///   in `context` followed by `target`
-    /// - [`DataError::BadCamera`] for no context and for viewing directions that cancel
-    /// - [`DataError::ZeroBaseline`] if the centres that determine the scale coincide within 4 f32 epsilons of their
+    /// - [`CameraError::BadCamera`] for no context and for viewing directions that cancel
+    /// - [`CameraError::ZeroBaseline`] if the centres that determine the scale coincide within 4 f32 epsilons of their
     ///   largest coordinate, the precision of files
     pub fn find(
         key: &str,
@@ -61,18 +61,22 @@ impl PoseNormalization {
         target: &[Pose],
         rotation: PoseRotation,
         scale: PoseScale,
-    ) -> Result<Self, DataError> {
+    ) -> Result<Self, CameraError> {
         for (frame, pose) in context.iter().chain(target).enumerate() {
-            pose.check_finite().map_err(DataError::in_frame(key, frame))?;
+            pose.check_finite().map_err(|source| CameraError::InFrame {
+                key: key.to_owned(),
+                frame,
+                source: Box::new(source),
+            })?;
         }
         if context.is_empty() {
-            return Err(DataError::BadCamera {
+            return Err(CameraError::BadCamera {
                 what: format!("scene {key} has no context views, so its poses cannot be normalised"),
             });
         }
         let rotation = match rotation {
             PoseRotation::Quaternion => mean_quaternion(context),
-            PoseRotation::Axes => mean_axes(context).ok_or_else(|| DataError::BadCamera {
+            PoseRotation::Axes => mean_axes(context).ok_or_else(|| CameraError::BadCamera {
                 what: format!("the context views of scene {key} look in opposite directions, which have no mean"),
             })?,
         };
@@ -85,7 +89,7 @@ impl PoseNormalization {
         let extent = largest(counted.iter().map(|pose| unscaled.normalize(**pose).translation));
         let threshold = 4.0 * f64::from(f32::EPSILON) * largest(counted.iter().map(|pose| pose.translation));
         if extent <= threshold {
-            return Err(DataError::ZeroBaseline { key: key.to_owned(), num_views: counted.len(), extent, threshold });
+            return Err(CameraError::ZeroBaseline { key: key.to_owned(), num_views: counted.len(), extent, threshold });
         }
         Ok(Self { scale: 1.0 / extent, ..unscaled })
     }
@@ -99,7 +103,11 @@ impl PoseNormalization {
     }
 }
 
-pub(crate) fn check_near(pose: &Pose) -> Result<(), DataError> {
+/// Checks that a normalised camera is within [`MAX_COORDINATE`] of the origin.
+///
+/// # Errors
+/// [`CameraError::BadCamera`].
+pub fn check_near(pose: &Pose) -> Result<(), CameraError> {
     let coordinate = pose.translation.abs().max_element();
     if coordinate <= MAX_COORDINATE {
         return Ok(());
@@ -108,7 +116,7 @@ pub(crate) fn check_near(pose: &Pose) -> Result<(), DataError> {
         "the camera is {coordinate:.0} times the contexts' extent away, expected at most {MAX_COORDINATE}: beyond that \
          f32 sums lose the colours"
     );
-    Err(DataError::BadCamera { what })
+    Err(CameraError::BadCamera { what })
 }
 
 fn largest(points: impl Iterator<Item = DVec3>) -> f64 {

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 
-use crate::geometry::camera::Intrinsics;
+use crate::geometry::camera::{Camera, Intrinsics};
 use crate::geometry::pose::Pose;
 
 /// Radius of an orbit over the extent of the context centres; farther out the contexts show little.
@@ -14,26 +14,17 @@ const FOCUS: f64 = 2.0;
 /// Bounds of the distance otherwise.
 const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
 
-/// One view to render, in the scene's normalised frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PathView {
-    /// Camera-to-world pose.
-    pub c2w: Pose,
-    /// Intrinsics in pixels of the rendered image.
-    pub intrinsics: Intrinsics,
-}
-
 /// Returns a smooth path through all context views in their order, from the first view to the last.
 ///
 /// Centres follow a Catmull-Rom spline. Orientations are interpolated spherically, intrinsics linearly.
-pub fn interpolate_path(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+pub fn interpolate_path(context: &[Camera], num_frames: usize) -> Vec<Camera> {
     let Some(last) = context.len().checked_sub(1) else { return Vec::new() };
     let time = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
     (0..num_frames).map(|frame| view_at(context, time(frame))).collect()
 }
 
 /// Interpolates the view at `time` in `[0, context.len() - 1]`.
-fn view_at(context: &[PathView], time: f64) -> PathView {
+fn view_at(context: &[Camera], time: f64) -> Camera {
     let last = context.len() - 1;
     let first = (time as usize).min(last.saturating_sub(1));
     let t = time - first as f64;
@@ -45,25 +36,25 @@ fn view_at(context: &[PathView], time: f64) -> PathView {
     let mix = |a: f64, b: f64| a + t * (b - a);
     let (a, b) = (from.intrinsics, to.intrinsics);
     let intrinsics = Intrinsics { fx: mix(a.fx, b.fx), fy: mix(a.fy, b.fy), cx: mix(a.cx, b.cx), cy: mix(a.cy, b.cy) };
-    PathView { c2w: Pose { rotation, translation }, intrinsics }
+    Camera { c2w: Pose { rotation, translation }, intrinsics }
 }
 
 /// Returns a closed ellipse around the mean view that faces the focus of the context views. The radii are 0.7 of the
 /// extent of the context centres. A frame after the last would equal the first.
-pub fn orbit_path(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+pub fn orbit_path(context: &[Camera], num_frames: usize) -> Vec<Camera> {
     let Some(intrinsics) = mean_intrinsics(context) else { return Vec::new() };
     let focus = focus_distance(context) * DVec3::Z;
     let extent = context.iter().fold(DVec3::ZERO, |extent, view| extent.max(view.c2w.translation.abs()));
     let radius = (ORBIT_SHARE * extent).max(DVec3::splat(MIN_ORBIT_RADIUS));
     let view = |frame: usize| {
         let (sin, cos) = (std::f64::consts::TAU * frame as f64 / num_frames as f64).sin_cos();
-        PathView { c2w: look_at(radius * DVec3::new(cos, sin, 0.0), focus), intrinsics }
+        Camera { c2w: look_at(radius * DVec3::new(cos, sin, 0.0), focus), intrinsics }
     };
     (0..num_frames).map(view).collect()
 }
 
 /// Returns the mean intrinsics of the context views, `None` for no views.
-pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
+pub fn mean_intrinsics(context: &[Camera]) -> Option<Intrinsics> {
     let count = context.len() as f64;
     let mean = |value: fn(&Intrinsics) -> f64| context.iter().map(|view| value(&view.intrinsics) / count).sum();
     (!context.is_empty()).then(|| Intrinsics {
@@ -75,7 +66,7 @@ pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
 }
 
 /// Returns the distance along the mean view's axis of the point nearest to the axes of all views (least squares).
-pub fn focus_distance(context: &[PathView]) -> f64 {
+pub fn focus_distance(context: &[Camera]) -> f64 {
     let (mut numerator, mut denominator) = (0.0, 0.0);
     for view in context {
         let axis = view.c2w.rotation.z_axis;
@@ -101,16 +92,16 @@ mod tests {
 
     const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
 
-    fn view(centre: [f64; 3], angle: f64) -> PathView {
-        PathView { c2w: Pose { rotation: DMat3::from_rotation_y(angle), translation: centre.into() }, intrinsics: K }
+    fn view(centre: [f64; 3], angle: f64) -> Camera {
+        Camera { c2w: Pose { rotation: DMat3::from_rotation_y(angle), translation: centre.into() }, intrinsics: K }
     }
 
-    fn assert_close(a: &PathView, b: &PathView, tolerance: f64) {
+    fn assert_close(a: &Camera, b: &Camera, tolerance: f64) {
         let (a, b) = (a.c2w.to_matrix_f64(), b.c2w.to_matrix_f64());
         assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < tolerance), "{a:?} {b:?}");
     }
 
-    fn walk() -> Vec<PathView> {
+    fn walk() -> Vec<Camera> {
         vec![
             view([-1.0, 0.0, 0.0], 0.4),
             view([-0.2, 0.1, 0.3], 0.1),
@@ -131,7 +122,7 @@ mod tests {
             assert!(view.c2w.orthonormality_defect() < 1e-12);
         }
         // No step is longer than a few times the mean step.
-        let step = |pair: &[PathView]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
+        let step = |pair: &[Camera]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
         assert!(path.windows(2).all(|pair| step(pair) < 0.2), "2 units in 30 steps");
     }
 

@@ -5,7 +5,7 @@
 
 use glam::{DMat3, DMat4, DQuat, DVec3, DVec4};
 
-use crate::error::DataError;
+use crate::error::CameraError;
 
 /// Largest entry of `R^T R - I` of an accepted rotation; published poses reach about 4e-4.
 const MAX_DEFECT: f64 = 1e-2;
@@ -33,23 +33,31 @@ impl Pose {
     /// Converts the upper three rows of a 4 x 4 matrix.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for a value that is not finite, for a rotation that departs from an orthonormal one by
+    /// [`CameraError::BadCamera`] for a value that is not finite, for a rotation that departs from an orthonormal one by
     /// more than 1e-2, and for a determinant below 0.
-    pub fn from_rows(rows: &[[f64; 4]; 3]) -> Result<Self, DataError> {
+    pub fn from_rows(rows: &[[f64; 4]; 3]) -> Result<Self, CameraError> {
         let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
         let pose = Self { rotation: DMat3::from_rows(x, y, z), translation: rows.map(|row| row[3]).into() };
-        pose.check_finite()?;
-        let defect = pose.orthonormality_defect();
-        if defect > MAX_DEFECT {
-            return Err(DataError::BadCamera {
-                what: format!("the rotation is off an orthonormal one by {defect:.3e}, more than {MAX_DEFECT:.0e}"),
-            });
-        }
-        let determinant = pose.rotation.determinant();
-        if determinant < 0.0 {
-            return Err(DataError::BadCamera { what: format!("the rotation mirrors (determinant {determinant:.3})") });
-        }
+        pose.validate()?;
         Ok(pose)
+    }
+
+    /// Checks that all numbers are finite and that the rotation is orthonormal up to 1e-2 and does not mirror.
+    ///
+    /// # Errors
+    /// [`CameraError::BadCamera`].
+    pub fn validate(self) -> Result<(), CameraError> {
+        self.check_finite()?;
+        let defect = self.orthonormality_defect();
+        let determinant = self.rotation.determinant();
+        let what = if defect > MAX_DEFECT {
+            format!("the rotation is off an orthonormal one by {defect:.3e}, more than {MAX_DEFECT:.0e}")
+        } else if determinant < 0.0 {
+            format!("the rotation mirrors (determinant {determinant:.3})")
+        } else {
+            return Ok(());
+        };
+        Err(CameraError::BadCamera { what })
     }
 
     /// Converts the upper three rows of a camera-to-world matrix with OpenGL camera axes (+x right, +y up, -z forward),
@@ -57,7 +65,7 @@ impl Pose {
     ///
     /// # Errors
     /// As [`Pose::from_rows`].
-    pub fn from_opengl(rows: &[[f64; 4]; 3]) -> Result<Self, DataError> {
+    pub fn from_opengl(rows: &[[f64; 4]; 3]) -> Result<Self, CameraError> {
         let Self { rotation, translation } = Self::from_rows(rows)?;
         Ok(Self { rotation: DMat3::from_cols(rotation.x_axis, -rotation.y_axis, -rotation.z_axis), translation })
     }
@@ -72,12 +80,17 @@ impl Pose {
         DMat4::from_mat3_translation(self.rotation, self.translation).to_rows_array()
     }
 
-    /// Converts a row-major 4 x 4 matrix. The last row is ignored.
+    /// Converts a row-major 4 x 4 matrix.
     ///
     /// # Errors
-    /// As [`Pose::from_rows`].
-    pub fn from_matrix(matrix: &[f64; 16]) -> Result<Self, DataError> {
-        Self::from_rows(&[0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| matrix[row * 4 + column])))
+    /// As [`Pose::from_rows`], and [`CameraError::BadCamera`] for another last row than `[0, 0, 0, 1]`.
+    pub fn from_matrix(matrix: &[f64; 16]) -> Result<Self, CameraError> {
+        let [x, y, z, last] = [0, 4, 8, 12].map(|start| [0, 1, 2, 3].map(|column| matrix[start + column]));
+        if last != [0.0, 0.0, 0.0, 1.0] {
+            let what = format!("the last row of the pose is {last:?}, expected [0, 0, 0, 1]");
+            return Err(CameraError::BadCamera { what });
+        }
+        Self::from_rows(&[x, y, z])
     }
 
     /// Returns the inverse motion `[R^T | -R^T t]` of an orthonormal rotation.
@@ -89,7 +102,8 @@ impl Pose {
 
     /// Returns the inverse of the matrix. Readers of the chunk format invert `w2c` as a matrix, and the inverse of a
     /// rotation rounded to f32 or to nine decimals differs from its transpose.
-    pub(crate) fn matrix_inverse(self) -> Self {
+    #[must_use]
+    pub fn matrix_inverse(self) -> Self {
         // With the two transposes glam rounds as the writers of existing files did.
         let rotation = self.rotation.transpose().inverse().transpose();
         Self { rotation, translation: -(rotation * self.translation) }
@@ -112,10 +126,14 @@ impl Pose {
         difference.to_cols_array().into_iter().fold(0.0, |largest: f64, value| largest.max(value.abs()))
     }
 
-    pub(crate) fn check_finite(self) -> Result<(), DataError> {
+    /// Checks that all numbers are finite.
+    ///
+    /// # Errors
+    /// [`CameraError::BadCamera`] with the first number that is not.
+    pub fn check_finite(self) -> Result<(), CameraError> {
         let mut values = self.rotation.to_rows_array().into_iter().chain(self.translation.to_array());
         match values.find(|value| !value.is_finite()) {
-            Some(value) => Err(DataError::BadCamera { what: format!("the pose holds {value}") }),
+            Some(value) => Err(CameraError::BadCamera { what: format!("the pose holds {value}") }),
             None => Ok(()),
         }
     }
@@ -124,7 +142,7 @@ impl Pose {
     ///
     // Not `DQuat::from_mat3`: for a rotation rounded to four digits it departs from scipy's `Rotation.from_matrix`,
     // which normalises published poses, by more than rounding.
-    pub(crate) fn quaternion(self) -> DQuat {
+    pub fn quaternion(self) -> DQuat {
         let [[xx, yx, zx], [xy, yy, zy], [xz, yz, zz]] = self.rotation.to_cols_array_2d();
         let squares = [1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz];
         let [wx, wy, wz] = [zy - yz, xz - zx, yx - xy];

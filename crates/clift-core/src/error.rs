@@ -1,0 +1,44 @@
+//! Errors of cameras and their normalization.
+
+/// A camera that cannot be used, or cameras without a normalized frame.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum CameraError {
+    /// A camera holds a NaN or an infinity, its rotation matrix is not orthonormal, or it is too far away.
+    #[error("bad camera: {what}")]
+    BadCamera {
+        /// Problem and the value found.
+        what: String,
+    },
+    /// The camera centres that define a scene's scale coincide.
+    #[error(
+        "scene {key} has no baseline: {}; remove the scene or choose other frames",
+        match num_views {
+            1 => "it has one view, and at least two are needed".to_owned(),
+            _ => format!(
+                "its {num_views} camera centres lie within {extent:.3e} of their mean, below the resolution of f32 files, \
+                 {threshold:.3e}"
+            ),
+        }
+    )]
+    ZeroBaseline {
+        /// Scene key.
+        key: String,
+        /// Number of views that define the scale.
+        num_views: usize,
+        /// Largest distance from the mean centre along an axis, in world units.
+        extent: f64,
+        /// Smallest accepted extent, in world units.
+        threshold: f64,
+    },
+    /// A pose of a scene cannot be used.
+    #[error("frame {frame} of scene {key}: {source}")]
+    InFrame {
+        /// Scene key.
+        key: String,
+        /// Position of the pose.
+        frame: usize,
+        /// Cause.
+        source: Box<CameraError>,
+    },
+}
