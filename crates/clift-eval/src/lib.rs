@@ -76,6 +76,7 @@ pub use sweep::sweep::Sweep;
 pub use statistics::compare::{Comparison, Evaluation, MethodFilter};
 pub use statistics::eval_results::EvalResults;
 pub use statistics::summary::Summary;
+pub use statistics::text_table::table;
 
 // Figures and animations.
 pub use figures::animation::Animation;

@@ -57,6 +57,34 @@ impl EvalConfig {
     pub fn lpips_path(&self) -> Option<&Path> {
         self.lpips_weights.as_deref().filter(|path| !path.as_os_str().is_empty())
     }
+
+    /// Returns the token counts of the renderings of a target view in a scene of `num_storage_tokens`, over all methods and
+    /// formats.
+    pub fn token_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
+        let counts = [vec![num_storage_tokens], self.render_counts(num_storage_tokens)].concat();
+        let num_formats: usize = self.methods.iter().map(|&method| self.formats_of(method).len()).sum();
+        counts.repeat(num_formats)
+    }
+
+    /// Returns the formats of a method: random tokens have no file, and the codec is that of condensed tokens.
+    pub(crate) fn formats_of(&self, method: Method) -> Vec<TokenCoding> {
+        let is_plain = |tokens: &TokenCoding| matches!(tokens, TokenCoding::Plain(_));
+        let formats: Vec<TokenCoding> = match method {
+            Method::Clift => self.formats.clone(),
+            Method::Random => Vec::new(),
+            _ => self.formats.iter().copied().filter(is_plain).collect(),
+        };
+        if formats.is_empty() { vec![TokenCoding::F32] } else { formats }
+    }
+
+    /// Returns the counts of `render` below `num_storage_tokens`, ascending.
+    pub(crate) fn render_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
+        let counts = self.render.iter().filter_map(|count| count.of(num_storage_tokens).ok());
+        let mut counts: Vec<usize> = counts.filter(|&count| count < num_storage_tokens).collect();
+        counts.sort_unstable();
+        counts.dedup();
+        counts
+    }
 }
 
 /// Reads a format or a list of formats, without duplicates.
@@ -115,6 +143,17 @@ mod tests {
         assert_eq!(formats(r#"{"formats": ["int8", "f32", "int8"]}"#).unwrap(), [TokenCoding::INT8, TokenCoding::F32]);
         assert!(formats(r#"{"formats": []}"#).unwrap_err().to_string().contains("at least one"));
         assert!(formats(r#"{"formats": "f64"}"#).unwrap_err().to_string().contains("int8"));
+    }
+
+    #[test]
+    fn render_counts_are_distinct_and_below_storage() {
+        let (count, share) = (TokenCount::Count, TokenCount::Share);
+        let render = vec![count(16), share(0.5), count(64), share(1.0), count(4)];
+        let eval = EvalConfig { render, ..EvalConfig::default() };
+        let cases: [(usize, &[usize]); 4] = [(128, &[4, 16, 64]), (32, &[4, 16]), (2, &[1]), (1, &[])];
+        for (num_storage_tokens, expected) in cases {
+            assert_eq!(eval.render_counts(num_storage_tokens), expected);
+        }
     }
 
     #[test]

@@ -1,5 +1,8 @@
 //! Rendering methods: own methods, two baselines, and external methods by name.
 
+use std::str::FromStr;
+
+use arrayvec::ArrayString;
 use clift_model::{Architecture, Grouping};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -88,11 +91,7 @@ impl Method {
 
 /// Name of an external method, in place: a [`Method`] is copied as often as a number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct MethodName {
-    /// UTF-8, followed by zeros.
-    bytes: [u8; MAX_NAME * MAX_CHAR_BYTES],
-    num_bytes: usize,
-}
+pub struct MethodName(ArrayString<{ MAX_NAME * MAX_CHAR_BYTES }>);
 
 impl MethodName {
     /// Checks a name: 1 to 40 printable characters, not the name of an own method.
@@ -107,26 +106,21 @@ impl MethodName {
         if Method::own().any(|own| own.name() == name) {
             return Err(bad("reserved for a method of clift; choose another name"));
         }
-        let mut bytes = [0; MAX_NAME * MAX_CHAR_BYTES];
-        bytes[..name.len()].copy_from_slice(name.as_bytes());
-        Ok(Self { bytes, num_bytes: name.len() })
+        ArrayString::from(name).map(Self).map_err(|_| bad("use 1 to 40 printable characters"))
     }
 
     /// Returns the name.
     pub fn as_str(&self) -> &str {
-        str::from_utf8(&self.bytes[..self.num_bytes]).unwrap_or_default()
+        self.0.as_str()
     }
 }
 
-impl Serialize for MethodName {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.as_str())
-    }
-}
+impl FromStr for Method {
+    type Err = EvalError;
 
-impl<'de> Deserialize<'de> for MethodName {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        Self::new(&String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
+    fn from_str(name: &str) -> Result<Self, EvalError> {
+        let own = Self::own().find(|method| method.name() == name);
+        own.map_or_else(|| MethodName::new(name).map(Self::External), Ok)
     }
 }
 
@@ -138,11 +132,7 @@ impl Serialize for Method {
 
 impl<'de> Deserialize<'de> for Method {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let name = String::deserialize(deserializer)?;
-        match Self::own().find(|method| method.name() == name) {
-            Some(method) => Ok(method),
-            None => MethodName::new(&name).map(Self::External).map_err(serde::de::Error::custom),
-        }
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 

@@ -32,7 +32,6 @@ const MIN_TIMED_VIEWS: usize = 20;
 
 /// The scenes and views of an evaluation, and the settings of every scene.
 pub struct Evaluator {
-    eval: EvalConfig,
     /// The settings of every scene.
     pub sweep: Sweep,
     description: RunDescription,
@@ -45,27 +44,27 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
-    /// Chooses the scenes and views of `eval` from the `frames` of `reader`. `sweep` has the settings of every scene; token counts and
-    /// formats equal those of `eval`. [`evaluate`](Self::evaluate) adds methods, LPIPS and external methods.
+    /// Chooses the scenes and views of `sweep.eval` from the `frames` of `reader`. [`evaluate`](Self::evaluate) adds LPIPS and
+    /// external methods to `sweep`.
     ///
     /// # Errors
     /// As [`evaluation_items`]; [`ModelError::BadConfig`] for a token count above the tokens of a scene, or a precision that
     /// the device does not have.
     pub fn new(
-        eval: EvalConfig,
         sweep: Sweep,
         description: RunDescription,
         reader: ClipReader,
         frames: EvalFrames,
         device: &Device,
     ) -> Result<Self, EvalError> {
+        let eval = &sweep.eval;
         eval.precision.check("eval.precision", device)?;
-        let (items, skip_report, split) = evaluation_items(&eval, &reader, frames)?;
+        let (items, skip_report, split) = evaluation_items(eval, &reader, frames)?;
         // An early check: a run must not fail after training.
         let tokens_per_view = sweep.model.num_patches(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
-        check_counts(&eval, fewest_views * tokens_per_view, sweep.model.architecture)?;
-        Ok(Self { eval, sweep, description, reader, items, split, skip_report, device: device.clone() })
+        check_counts(eval, fewest_views * tokens_per_view, sweep.model.architecture)?;
+        Ok(Self { sweep, description, reader, items, split, skip_report, device: device.clone() })
     }
 
     /// Returns the keys of the measured scenes.
@@ -99,10 +98,9 @@ impl Evaluator {
         progress: &mut dyn EvalProgress,
     ) -> Result<Summary, EvalError> {
         let lpips = self.lpips(progress)?;
-        let methods = self.methods(models)?;
+        let (methods, formats) = (self.methods(models)?, self.formats(models, progress)?);
         let sweep = Sweep {
-            formats: self.formats(models, progress)?,
-            methods,
+            eval: EvalConfig { methods, formats, ..self.sweep.eval.clone() },
             lpips: lpips.clone().ok(),
             external_methods: external_methods.to_vec(),
             min_timed_views: MIN_TIMED_VIEWS,
@@ -118,7 +116,7 @@ impl Evaluator {
             }
             sheets.as_ref().map_or(Ok(()), |sheets| sheets.add(&scene.contact_sheet, key))
         };
-        let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.eval.num_sheets };
+        let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.sweep.eval.num_sheets };
         let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
         match &lpips {
             Ok(lpips) => measured.lpips_sha256 = Some(lpips.sha256().into()),
@@ -165,7 +163,7 @@ impl Evaluator {
         keep_figures: &mut dyn FnMut(&str, SceneFigures) -> Result<(), EvalError>,
         progress: &mut dyn EvalProgress,
     ) -> Result<(EvalResults, SkipReport), EvalError> {
-        let _precision = self.eval.precision.scope();
+        let _precision = self.sweep.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
         measured.split = Some(self.split);
         measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
@@ -222,7 +220,7 @@ impl Evaluator {
 
     /// Returns the formats of the stored tokens, without coded ones if the model has no codec.
     fn formats(&self, models: &EvalModels, progress: &mut dyn EvalProgress) -> Result<Vec<TokenCoding>, EvalError> {
-        let mut formats = self.eval.formats.clone();
+        let mut formats = self.sweep.eval.formats.clone();
         let is_coded = |format: &TokenCoding| matches!(format, TokenCoding::Coded(_));
         if let Some(coded) = formats.iter().copied().find(is_coded).filter(|_| models.codec.is_none()) {
             let fix = "the model has no token codec: fit it with `clift codec RUN`";
@@ -239,7 +237,7 @@ impl Evaluator {
     /// Loads LPIPS, or returns the reason why LPIPS is not measured.
     fn lpips(&self, progress: &mut dyn EvalProgress) -> Result<Result<Lpips, String>, EvalError> {
         let size = self.reader.options.width.min(self.reader.options.height);
-        Ok(match self.eval.lpips_path() {
+        Ok(match self.sweep.eval.lpips_path() {
             _ if size < LPIPS_MIN_SIZE_PX => {
                 Err(format!("images are smaller than {LPIPS_MIN_SIZE_PX} x {LPIPS_MIN_SIZE_PX} pixels"))
             }
@@ -268,7 +266,7 @@ impl Evaluator {
     /// Returns the methods of the config, or all methods with weights. Networks without clusters
     /// beside the run are always measured.
     fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
-        let requested = &self.eval.methods;
+        let requested = &self.sweep.eval.methods;
         if requested.is_empty() {
             return Ok(models.methods());
         }

@@ -11,8 +11,6 @@ use crate::figures::canvas::Canvas;
 pub struct Animation {
     path: PathBuf,
     writer: png::Writer<BufWriter<File>>,
-    /// Frames still to add. The encoder itself would finish a file with too few frames.
-    missing: usize,
 }
 
 impl Animation {
@@ -25,12 +23,14 @@ impl Animation {
         let mut encoder = png::Encoder::new(file, width as u32, height as u32);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
+        // Refuses more or fewer frames than the header states.
+        encoder.validate_sequence(true);
         let started = encoder
             .set_animated(num_frames as u32, 0)
             .and_then(|()| encoder.set_frame_delay(1, fps))
             .and_then(|()| encoder.write_header());
         let writer = started.map_err(|error| failed(path, error))?;
-        Ok(Self { path: path.into(), writer, missing: num_frames })
+        Ok(Self { path: path.into(), writer })
     }
 
     /// Adds the next frame.
@@ -38,12 +38,7 @@ impl Animation {
     /// # Errors
     /// [`EvalError::Io`] for an image of another size, or more than `num_frames` frames.
     pub fn add(&mut self, image: &Canvas) -> Result<(), EvalError> {
-        let Some(missing) = self.missing.checked_sub(1) else {
-            return Err(failed(&self.path, "more frames than num_frames"));
-        };
-        self.writer.write_image_data(image.as_rgb8()).map_err(|error| failed(&self.path, error))?;
-        self.missing = missing;
-        Ok(())
+        self.writer.write_image_data(image.as_rgb8()).map_err(|error| failed(&self.path, error))
     }
 
     /// Completes the file.
@@ -51,15 +46,11 @@ impl Animation {
     /// # Errors
     /// [`EvalError::Io`] for fewer than `num_frames` frames, or a file that cannot be written.
     pub fn finish(self) -> Result<(), EvalError> {
-        let Self { path, writer, missing } = self;
-        if missing > 0 {
-            return Err(failed(&path, format!("{missing} frames fewer than num_frames")));
-        }
-        writer.finish().map_err(|error| failed(&path, error))
+        self.writer.finish().map_err(|error| failed(&self.path, error))
     }
 }
 
-fn failed(path: &Path, error: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> EvalError {
+fn failed(path: &Path, error: png::EncodingError) -> EvalError {
     EvalError::io("encoding the animation", path)(std::io::Error::other(error))
 }
 

@@ -119,7 +119,7 @@ impl Report {
                     (first.key.method.name()) " reaches " (psnr_at(first))
                     @if first != last { " and " (psnr_at(last)) }
                     "."
-                    @if let Some(gain) = last.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
+                    @if let Some(gain) = last.quality.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
                         (if first == last { " This is " } else { " The latter is " }) (grouped(gain.abs(), 2)) " dB "
                         (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view"
                         @if baselines.nearest_view.num_identical_views > 0 {
@@ -133,7 +133,7 @@ impl Report {
             dl.tiles {
                 @for point in first.into_iter().chain(last.filter(|_| whole.len() > 1)) {
                     @let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
-                    (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
+                    (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.quality.psnr, 2), "dB", &error))
                 }
                 (tile("nearest view", &number(nearest, 2), "dB", &copies(baselines.nearest_view.num_identical_views)))
                 @if let Some((point, kb)) = first.and_then(|point| Some((point, point.cost.scene_kb()?))) {
@@ -193,7 +193,7 @@ impl Report {
 }
 
 fn psnr_at(point: &SummaryPoint) -> Markup {
-    html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.key.num_storage_tokens)) " stored tokens" }
+    html! { strong { (number(point.quality.psnr, 2)) " dB" } " with " (count(point.key.num_storage_tokens)) " stored tokens" }
 }
 
 /// Returns the note on the baseline of copied context views.

@@ -105,7 +105,7 @@ fn levels(summary: &Summary) -> Vec<Level> {
 
 /// Returns the mark of a point at `x`; `None` without PSNR.
 fn mark(point: &SummaryPoint, x: f64) -> Option<Mark> {
-    let y = point.psnr?;
+    let y = point.quality.psnr?;
     let EvalKey { num_storage_tokens: stored, num_render_tokens: rendered, .. } = point.key;
     let tokens = match (stored, point.key.is_whole()) {
         (0, _) => String::new(),
@@ -189,7 +189,7 @@ fn front(
     x: impl Fn(&SummaryPoint) -> Option<f64>,
 ) -> Vec<(f64, f64)> {
     let points = summary.points.iter().filter(|point| is_on_front(point));
-    let mut front: Vec<_> = points.filter_map(|point| Some((x(point)?, point.psnr?))).collect();
+    let mut front: Vec<_> = points.filter_map(|point| Some((x(point)?, point.quality.psnr?))).collect();
     front.sort_by(|a, b| a.0.total_cmp(&b.0));
     front
 }

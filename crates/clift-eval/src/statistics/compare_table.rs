@@ -2,42 +2,15 @@
 
 use std::fmt;
 
-use crate::statistics::compare::{Comparison, MetricDifference, PairedRow, RowKey};
-
-impl fmt::Display for RowKey {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { method, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
-        f.write_str(method)?;
-        match (stored, stored == rendered) {
-            (0, _) => {}
-            (_, true) => write!(f, " {stored}")?,
-            (_, false) => write!(f, " {rendered} of {stored}")?,
-        }
-        if tokens.is_empty() { Ok(()) } else { write!(f, " {tokens}") }
-    }
-}
+use crate::statistics::compare::{Comparison, PairedRow};
+use crate::statistics::metric_difference::MetricDifference;
+use crate::statistics::text_table::table;
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "A: {}\nB: {}\n", self.a.display(), self.b.display())?;
-        let names: Vec<String> = self.pairs.iter().map(name).collect();
-        let width = names.iter().map(|name| name.chars().count()).max().unwrap_or_default();
-        writeln!(
-            f,
-            "{:<width$}  scenes  PSNR of A  B - A, dB (95 %)          B - A, SSIM (95 %)            B - A, LPIPS (95 %)",
-            "method"
-        )?;
-        for (pair, name) in self.pairs.iter().zip(&names) {
-            let psnr = pair.psnr.map_or_else(|| "-".into(), |difference| format!("{:.2}", difference.a));
-            let line = format!(
-                "{name:<width$}  {:>6}  {psnr:>9}  {:<28}  {:<28}  {}",
-                pair.num_scenes,
-                interval(pair.psnr, 3),
-                interval(pair.ssim, 4),
-                interval(pair.lpips_vgg, 4)
-            );
-            writeln!(f, "{}", line.trim_end())?;
-        }
+        let header = ["method", "scenes", "PSNR of A", "B - A, dB (95 %)", "B - A, SSIM (95 %)", "B - A, LPIPS (95 %)"];
+        writeln!(f, "{}", table(header, self.pairs.iter().map(cells)))?;
         writeln!(
             f,
             "\nMeans of paired differences over scenes, with 95 % intervals of Student's t; *: the interval excludes zero. Lower \
@@ -55,7 +28,7 @@ impl fmt::Display for Comparison {
         }
         for (side, keys) in [("A", &self.only_a), ("B", &self.only_b)] {
             if !keys.is_empty() {
-                let keys = keys.iter().map(RowKey::to_string).collect::<Vec<_>>().join(", ");
+                let keys = keys.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
                 writeln!(f, "Only in {side}, not compared: {keys}.")?;
             }
         }
@@ -66,8 +39,15 @@ impl fmt::Display for Comparison {
     }
 }
 
-fn name(pair: &PairedRow) -> String {
-    if pair.a == pair.b { pair.a.to_string() } else { format!("{} -> {}", pair.a, pair.b) }
+fn cells(pair: &PairedRow) -> [String; 6] {
+    [
+        if pair.a == pair.b { pair.a.to_string() } else { format!("{} -> {}", pair.a, pair.b) },
+        pair.num_scenes.to_string(),
+        pair.psnr.map_or_else(|| "-".into(), |difference| format!("{:.2}", difference.a)),
+        interval(pair.psnr, 3),
+        interval(pair.ssim, 4),
+        interval(pair.lpips_vgg, 4),
+    ]
 }
 
 fn interval(difference: Option<MetricDifference>, decimals: usize) -> String {

@@ -2,11 +2,14 @@
 
 use std::path::Path;
 
-use clift_core::{mean, replace_file};
+use clift_core::replace_file;
+use clift_model::TokenCoding;
+use serde::Deserialize;
 
+use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::view_metrics::ViewMetrics;
+use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SSIM, ViewMetrics, view_mean};
 
 const VIEW_COLUMNS: [&str; 11] = [
     "scene",
@@ -48,13 +51,44 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
     write(path, VIEW_COLUMNS, rows).map_err(EvalError::io("writing the metrics of the views", path))
 }
 
+/// A row of `views.csv`.
+#[derive(Deserialize)]
+struct ViewRow {
+    scene: String,
+    target_frame: usize,
+    method: Method,
+    num_storage_tokens: usize,
+    num_render_tokens: usize,
+    psnr: f64,
+    ssim: Option<f64>,
+    lpips_vgg: Option<f64>,
+    render_s: Option<f64>,
+    select_s: Option<f64>,
+    tokens: Option<TokenCoding>,
+}
+
+/// Reads `views.csv`.
+///
+/// # Errors
+/// [`EvalError::NotComparable`] for a file of another format, [`EvalError::DuplicateView`] for two rows of one view.
+pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
+    let bad = |error: csv::Error| EvalError::NotComparable { reason: error.to_string(), path: path.into() };
+    let mut results = EvalResults::default();
+    for row in csv::Reader::from_path(path).map_err(bad)?.deserialize() {
+        let row: ViewRow = row.map_err(bad)?;
+        let ViewRow { method, num_storage_tokens, num_render_tokens, tokens, .. } = row;
+        let ViewRow { psnr, ssim, lpips_vgg, render_s, select_s, .. } = row;
+        let key = EvalKey { method, num_storage_tokens, num_render_tokens, tokens };
+        let view = ViewMetrics { psnr, ssim, lpips_vgg, render_s, select_s };
+        results.add(&row.scene, row.target_frame, key, view)?;
+    }
+    Ok(results)
+}
+
 /// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene.
 pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
         scenes.iter().map(move |(scene, views)| {
-            let mean_of = |value: fn(&ViewMetrics) -> Option<f64>| {
-                text(mean(&views.values().filter_map(value).collect::<Vec<_>>()))
-            };
             [
                 scene.clone(),
                 key.method.name().into(),
@@ -62,9 +96,9 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
                 key.num_render_tokens.to_string(),
                 key.format_name(),
                 views.len().to_string(),
-                mean_of(|view| Some(view.capped_psnr())),
-                mean_of(|view| view.ssim),
-                mean_of(|view| view.lpips_vgg),
+                text(view_mean(views, PSNR)),
+                text(view_mean(views, SSIM)),
+                text(view_mean(views, LPIPS)),
             ]
         })
     });
@@ -91,8 +125,6 @@ fn write<const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::method::Method;
-    use crate::statistics::view_metrics::EvalKey;
     use crate::testing::CLIFT;
 
     #[test]

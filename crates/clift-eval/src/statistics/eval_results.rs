@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::method::MethodName;
+use crate::config::method::Method;
 use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
@@ -33,7 +33,7 @@ pub struct EvalResults {
     scene_bytes: BTreeMap<EvalKey, Vec<u64>>,
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
-    pub(crate) missing: BTreeMap<MethodName, BTreeSet<String>>,
+    pub(crate) missing: BTreeMap<Method, BTreeSet<String>>,
     pub(crate) lpips_sha256: Option<String>,
     /// How rendered tokens were selected; `None` where every view was rendered from all stored tokens.
     pub(crate) selection: Option<Selection>,
@@ -121,7 +121,7 @@ impl EvalResults {
     }
 
     /// Records an image that an external method does not have.
-    pub fn record_missing_image(&mut self, method: MethodName, image: String) {
+    pub fn record_missing_image(&mut self, method: Method, image: String) {
         self.missing.entry(method).or_default().insert(image);
     }
 }

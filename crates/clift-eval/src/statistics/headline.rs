@@ -35,7 +35,7 @@ impl Summary {
             let psnr = |count: usize| {
                 let of_method = whole.clone().filter(|point| point.key.method == method);
                 let points = of_method.filter(|point| point.key.num_storage_tokens == count);
-                points.min_by_key(|point| point.key.tokens).and_then(|point| point.psnr)
+                points.min_by_key(|point| point.key.tokens).and_then(|point| point.quality.psnr)
             };
             if shown.iter().all(|&count| psnr(count).is_none()) {
                 continue;

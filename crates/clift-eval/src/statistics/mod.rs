@@ -4,11 +4,13 @@
 //! - `eval_results`: metrics of every view
 //! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front
+//! - `metric_difference`: paired differences of views, with confidence intervals
 //! - `paired`: paired differences of methods
 //! - `scene_scores`: scenes from worst to best
 //! - `summary`: summary.json
 //! - `headline`: the result in a few lines
 //! - `csv_files`: views.csv and scenes.csv
+//! - `text_table`: aligned columns
 //! - `table`: the terminal table
 //! - `compare`: two evaluations, view by view
 //! - `compare_table`: its terminal table
@@ -18,10 +20,12 @@ pub(crate) mod compare_table;
 pub(crate) mod csv_files;
 pub(crate) mod eval_results;
 pub(crate) mod headline;
+pub(crate) mod metric_difference;
 pub(crate) mod paired;
 pub(crate) mod pareto;
 pub(crate) mod scene_scores;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;
+pub(crate) mod text_table;
 pub(crate) mod view_metrics;

@@ -1,17 +1,12 @@
-//! Paired differences of methods, scene by scene.
-//!
-//! Scenes differ far more than methods. The standard error is therefore computed from the differences within scenes, not
-//! from two means.
+//! Paired differences of the methods of an evaluation.
 
-use std::collections::BTreeMap;
-
-use clift_core::{mean, standard_error};
 use clift_model::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
-use crate::statistics::eval_results::{EvalResults, SceneViews};
-use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
+use crate::statistics::eval_results::EvalResults;
+use crate::statistics::metric_difference::{MetricDifference, common_views};
+use crate::statistics::view_metrics::{EvalKey, PSNR};
 
 /// Pairs of methods, the better method of the paper first (sections 4.2, 4.3); it is compared with other networks too.
 const ORDERINGS: [[Method; 2]; 5] = [
@@ -49,34 +44,25 @@ pub fn differences(results: &EvalResults) -> Vec<PairedDifference> {
         for (key, better) in results.views().filter(|(key, _)| key.method == method && key.is_whole()) {
             let tokens = if against == Method::Random { Some(TokenCoding::F32) } else { key.tokens };
             let Some(other) = results.of(EvalKey { method: against, tokens, ..key }) else { continue };
-            let per_scene = scene_differences(better, other);
-            differences.extend(mean(&per_scene).map(|psnr| PairedDifference {
+            let common = common_views(other, better);
+            differences.extend(MetricDifference::new(&common, PSNR).map(|psnr| PairedDifference {
                 method,
                 against,
                 num_storage_tokens: key.num_storage_tokens,
                 tokens: key.tokens,
-                num_scenes: per_scene.len(),
-                psnr,
-                psnr_stderr: standard_error(&per_scene),
+                num_scenes: common.len(),
+                psnr: psnr.mean,
+                psnr_stderr: psnr.stderr,
             }));
         }
     }
     differences
 }
 
-/// Returns the mean PSNR difference of every scene over the common views.
-fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
-    let of_scene = |(scene, views): (&String, &BTreeMap<usize, ViewMetrics>)| {
-        let others = other.get(scene)?;
-        let pairs = views.iter().filter_map(|(frame, view)| Some((view, others.get(frame)?)));
-        mean(&pairs.map(|(view, against)| view.capped_psnr() - against.capped_psnr()).collect::<Vec<_>>())
-    };
-    better.iter().filter_map(of_scene).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::statistics::view_metrics::ViewMetrics;
     use crate::testing::f32_key as key;
 
     fn differences_of(rows: &[(&str, usize, EvalKey, f64)]) -> Vec<PairedDifference> {

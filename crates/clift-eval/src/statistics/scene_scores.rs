@@ -3,11 +3,9 @@
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use clift_core::mean;
-
 use crate::config::method::Method;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::view_metrics::{EvalKey, ViewMetrics, best_method};
+use crate::statistics::view_metrics::{EvalKey, PSNR, ViewMetrics, best_method, view_mean};
 
 /// The mean PSNR of one scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -38,17 +36,13 @@ impl SceneScores {
         let Some((key, views)) = most else { return Self::default() };
         let nearest = results.of(EvalKey::baseline(Method::NearestView));
         let score = |(scene, frames): (&String, &BTreeMap<usize, ViewMetrics>)| {
-            let nearest_psnr = nearest.and_then(|views| mean_psnr(views.get(scene)?));
-            Some(SceneScore { scene: scene.clone(), psnr: mean_psnr(frames)?, nearest_psnr })
+            let nearest_psnr = nearest.and_then(|views| view_mean(views.get(scene)?, PSNR));
+            Some(SceneScore { scene: scene.clone(), psnr: view_mean(frames, PSNR)?, nearest_psnr })
         };
         let mut scenes: Vec<SceneScore> = views.iter().filter_map(score).collect();
         scenes.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
         Self { key: Some(key), scenes }
     }
-}
-
-fn mean_psnr(views: &BTreeMap<usize, ViewMetrics>) -> Option<f64> {
-    mean(&views.values().map(ViewMetrics::capped_psnr).collect::<Vec<_>>())
 }
 
 #[cfg(test)]

@@ -16,9 +16,11 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::view_metrics::{Cost, EvalKey, PSNR_CAP_DB, ViewMetrics, best_method};
+use crate::statistics::view_metrics::{
+    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SSIM, ViewMetrics, best_method, view_mean,
+};
 
-/// Means of a baseline.
+/// Means over the views of a scene, then over scenes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
     /// Mean over scenes of the scene's mean PSNR, in dB.
@@ -48,20 +50,15 @@ pub struct SummaryPoint {
     pub key: EvalKey,
     /// Measured views; below the views of the evaluation only for an external method with missing images.
     pub num_views: usize,
-    /// Mean over scenes of the scene's mean PSNR, in dB.
-    pub psnr: Option<f64>,
+    /// Means over the views of a scene, then over scenes.
+    #[serde(flatten)]
+    pub quality: Quality,
     /// Standard error of `psnr` over scenes; `null` for a single scene.
     pub psnr_stderr: Option<f64>,
     /// Mean PSNR over all views, in dB. Equals `psnr` if all scenes have the same number of views.
     pub psnr_per_view: Option<f64>,
-    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
-    pub num_identical_views: usize,
-    /// Mean over scenes of the scene's mean SSIM.
-    pub ssim: Option<f64>,
     /// Mean SSIM over all views.
     pub ssim_per_view: Option<f64>,
-    /// Mean over scenes of the scene's mean LPIPS.
-    pub lpips_vgg: Option<f64>,
     /// Mean LPIPS over all views.
     pub lpips_vgg_per_view: Option<f64>,
     /// Mean rendering time per view, in seconds.
@@ -138,8 +135,8 @@ impl Summary {
             .collect();
         let scenes: BTreeSet<&str> = views.iter().map(|(scene, _)| *scene).collect();
         let quality = |method| results.of(EvalKey::baseline(method)).map(Quality::new).unwrap_or_default();
-        let missing = results.missing.iter().map(|(&name, images)| MissingImages {
-            method: Method::External(name),
+        let missing = results.missing.iter().map(|(&method, images)| MissingImages {
+            method,
             num_missing: images.len(),
             images: images.iter().cloned().collect(),
         });
@@ -203,16 +200,16 @@ pub(crate) fn context_targets_note(num_given: usize) -> Option<String> {
 }
 
 /// Returns the mean over the views of each scene, for the scenes that have a value.
-fn scene_means(views: &SceneViews, value: fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
-    views.values().filter_map(|frames| mean(&frames.values().filter_map(value).collect::<Vec<_>>())).collect()
+fn scene_means(views: &SceneViews, metric: Metric) -> Vec<f64> {
+    views.values().filter_map(|frames| view_mean(frames, metric)).collect()
 }
 
 impl Quality {
     fn new(views: &SceneViews) -> Self {
         Self {
-            psnr: mean(&scene_means(views, |view| Some(view.capped_psnr()))),
-            ssim: mean(&scene_means(views, |view| view.ssim)),
-            lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
+            psnr: mean(&scene_means(views, PSNR)),
+            ssim: mean(&scene_means(views, SSIM)),
+            lpips_vgg: mean(&scene_means(views, LPIPS)),
             num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
         }
     }
@@ -220,24 +217,18 @@ impl Quality {
 
 impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
-        let Quality { psnr, ssim, lpips_vgg, num_identical_views } = Quality::new(scenes);
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
-        let values = |value: fn(&ViewMetrics) -> Option<f64>| -> Vec<f64> {
-            views.iter().filter_map(|view| value(view)).collect()
-        };
+        let per_view = |metric: Metric| mean(&views.iter().filter_map(|view| metric(view)).collect::<Vec<_>>());
         let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
         let (render_s, select_s, frame_s) = timed(results, key);
         Self {
             key,
             num_views: views.len(),
-            psnr,
-            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(view.capped_psnr()))),
-            psnr_per_view: mean(&values(|view| Some(view.capped_psnr()))),
-            num_identical_views,
-            ssim,
-            ssim_per_view: mean(&values(|view| view.ssim)),
-            lpips_vgg,
-            lpips_vgg_per_view: mean(&values(|view| view.lpips_vgg)),
+            quality: Quality::new(scenes),
+            psnr_stderr: standard_error(&scene_means(scenes, PSNR)),
+            psnr_per_view: per_view(PSNR),
+            ssim_per_view: per_view(SSIM),
+            lpips_vgg_per_view: per_view(LPIPS),
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
             render_p95_s: statistic(&render_s, p95),
@@ -265,13 +256,14 @@ fn timed(results: &EvalResults, key: EvalKey) -> (Vec<f64>, Vec<f64>, Vec<f64>) 
     };
     let views = results.views().filter(|(other, _)| is_same(*other)).flat_map(|(_, scenes)| scenes.values());
     let views: Vec<&ViewMetrics> = views.flat_map(BTreeMap::values).collect();
-    let values = |value: fn(&ViewMetrics) -> Option<f64>| views.iter().filter_map(|view| value(view)).collect();
+    let values = |metric: Metric| views.iter().filter_map(|view| metric(view)).collect();
     (values(|view| view.render_s), values(|view| view.select_s), values(ViewMetrics::frame_s))
 }
 
 fn mark_fronts(points: &mut [SummaryPoint]) {
     let of = |points: &[SummaryPoint], cost: fn(&SummaryPoint) -> Option<[f64; 2]>| {
-        let position = |point: &SummaryPoint| (cost(point).unwrap_or([f64::NAN; 2]), point.psnr.unwrap_or(f64::NAN));
+        let position =
+            |point: &SummaryPoint| (cost(point).unwrap_or([f64::NAN; 2]), point.quality.psnr.unwrap_or(f64::NAN));
         pareto_front(&points.iter().map(position).collect::<Vec<_>>())
     };
     for i in of(points, |point| point.frame_quartiles_s) {
@@ -306,8 +298,8 @@ mod tests {
             (&[("a", 0, f64::INFINITY), ("b", 0, 20.0)], 60.0, 60.0, Some(40.0), 1),
         ] {
             let point = Summary::new(&results(views)).points.remove(0);
-            assert_eq!((point.psnr, point.psnr_per_view), (Some(psnr), Some(psnr_per_view)));
-            assert_eq!((point.psnr_stderr, point.num_identical_views), (psnr_stderr, num_identical));
+            assert_eq!((point.quality.psnr, point.psnr_per_view), (Some(psnr), Some(psnr_per_view)));
+            assert_eq!((point.psnr_stderr, point.quality.num_identical_views), (psnr_stderr, num_identical));
         }
         // Sums of these values depend on their order in the last bit.
         let mut views = [("a", 0, 20.1), ("a", 1, 22.7), ("a", 2, 1e-9), ("b", 0, 30.3), ("c", 5, 17.77)];

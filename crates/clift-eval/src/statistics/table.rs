@@ -4,12 +4,14 @@ use std::fmt;
 
 use crate::config::method::Method;
 use crate::statistics::paired::PairedDifference;
-use crate::statistics::summary::{Quality, Summary};
+use crate::statistics::summary::{Quality, Summary, SummaryPoint};
+use crate::statistics::text_table::table;
 
 /// Largest number of missing images in the table; `summary.json` has all.
 const MAX_NAMED: usize = 3;
 
-const HEADERS: [&str; 13] = [
+const HEADER: [&str; 15] = [
+    "method",
     "stored",
     "rendered",
     "format",
@@ -23,8 +25,8 @@ const HEADERS: [&str; 13] = [
     "GMAC",
     "values",
     "scene kB",
+    "",
 ];
-const WIDTHS: [usize; 13] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 13, 7, 8, 9];
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -35,55 +37,9 @@ impl fmt::Display for Summary {
             writeln!(f, "warning: {warning}")?;
         }
         writeln!(f)?;
-        let names = points.iter().map(|point| point.key.method.name().chars().count());
-        let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
-        let formats = points.iter().map(|point| point.key.format_name().len());
-        let mut widths = WIDTHS;
-        widths[2] = formats.fold(WIDTHS[2], usize::max);
-        let mut row = |name: &str, cells: [String; 13], mark: &str| {
-            write!(f, "{name:<width$}")?;
-            for (cell, width) in cells.iter().zip(widths) {
-                write!(f, " {cell:>width$}")?;
-            }
-            writeln!(f, "{mark}")
-        };
-        row("method", HEADERS.map(str::to_owned), "")?;
-        for (method, Quality { psnr, ssim, lpips_vgg, num_identical_views }) in
-            [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)]
-        {
-            let mut cells = std::array::from_fn(|_| cell(None, 0));
-            (cells[3], cells[5], cells[6]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
-            let identical = format!(" {num_identical_views} of {num_views} views identical to the target");
-            row(method.name(), cells, if num_identical_views > 0 { &identical } else { "" })?;
-        }
-        for point in points {
-            let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
-            let ms = |seconds: Option<f64>| cell(seconds.map(|seconds| seconds * 1e3), 1);
-            let cells = [
-                count(point.key.num_storage_tokens),
-                count(point.key.num_render_tokens),
-                point.key.tokens.map_or_else(|| "-".to_owned(), |tokens| tokens.to_string()),
-                cell(point.psnr, 2),
-                cell(point.psnr_stderr, 2),
-                cell(point.ssim, 3),
-                cell(point.lpips_vgg, 3),
-                ms(point.render_median_s),
-                ms(point.frame_median_s),
-                point
-                    .frame_quartiles_s
-                    .map_or("-".into(), |[low, high]| format!("{:.1}..{:.1}", low * 1e3, high * 1e3)),
-                cell(point.cost.gflops, point.cost.gflops_decimals()),
-                point.cost.scene_values.map_or_else(|| cell(None, 0), |values| values.to_string()),
-                cell(point.cost.scene_kb(), 1),
-            ];
-            let mark = match (point.pareto_time, point.pareto_bytes) {
-                (true, true) => " tb",
-                (true, false) => " t",
-                (false, true) => "  b",
-                (false, false) => "",
-            };
-            row(point.key.method.name(), cells, mark)?;
-        }
+        let baselines = [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)];
+        let baselines = baselines.map(|(method, quality)| baseline_cells(method, quality, *num_views));
+        writeln!(f, "{}", table(HEADER, baselines.into_iter().chain(points.iter().map(point_cells))))?;
         if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
             writeln!(
                 f,
@@ -112,6 +68,40 @@ impl fmt::Display for Summary {
         }
         Ok(())
     }
+}
+
+fn baseline_cells(method: Method, quality: Quality, num_views: usize) -> [String; HEADER.len()] {
+    let Quality { psnr, ssim, lpips_vgg, num_identical_views } = quality;
+    let mut cells = HEADER.map(|_| cell(None, 0));
+    cells[0] = method.name().into();
+    (cells[4], cells[6], cells[7]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
+    let has_copies = num_identical_views > 0;
+    let copies = has_copies.then(|| format!("{num_identical_views} of {num_views} views identical to the target"));
+    cells[14] = copies.unwrap_or_default();
+    cells
+}
+
+fn point_cells(point: &SummaryPoint) -> [String; HEADER.len()] {
+    let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
+    let ms = |seconds: Option<f64>| cell(seconds.map(|seconds| seconds * 1e3), 1);
+    let quartiles = point.frame_quartiles_s.map(|[low, high]| format!("{:.1}..{:.1}", low * 1e3, high * 1e3));
+    [
+        point.key.method.name().into(),
+        count(point.key.num_storage_tokens),
+        count(point.key.num_render_tokens),
+        point.key.tokens.map_or_else(|| cell(None, 0), |tokens| tokens.to_string()),
+        cell(point.quality.psnr, 2),
+        cell(point.psnr_stderr, 2),
+        cell(point.quality.ssim, 3),
+        cell(point.quality.lpips_vgg, 3),
+        ms(point.render_median_s),
+        ms(point.frame_median_s),
+        quartiles.unwrap_or_else(|| cell(None, 0)),
+        cell(point.cost.gflops, point.cost.gflops_decimals()),
+        point.cost.scene_values.map_or_else(|| cell(None, 0), |values| values.to_string()),
+        cell(point.cost.scene_kb(), 1),
+        [if point.pareto_time { "t" } else { "" }, if point.pareto_bytes { "b" } else { "" }].concat(),
+    ]
 }
 
 fn cell(value: Option<f64>, decimals: usize) -> String {
@@ -143,7 +133,7 @@ mod tests {
         let name = MethodName::new("DepthSplat").unwrap();
         let other = EvalKey::baseline(Method::External(name));
         views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
-        views.record_missing_image(name, "b/000000.png".into());
+        views.record_missing_image(other.method, "b/000000.png".into());
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         let cost =
             Cost { gflops: Some(45.23), scene_values: Some(49_152), scene_bytes: Some(99_000), ..Cost::default() };
@@ -152,11 +142,11 @@ mod tests {
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
 
-method        stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms       half ms    GMAC   values  scene kB
-nearest_view       -         -      -    18.00      -  0.500      -          -         -             -       -        -         -
-mean_image         -         -      -        -      -      -      -          -         -             -       -        -         -
-clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    11.2..11.8    45.2    49152      99.0 tb
-DepthSplat         -         -      -    19.00      -      -  0.250          -         -             -       -        -         -
+method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  render ms  frame ms  half ms     GMAC  values  scene kB
+nearest_view  -       -         -       18.00    -      0.500  -      -          -         -           -     -       -
+mean_image    -       -         -       -        -      -      -      -          -         -           -     -       -
+clift         64      32        int8    20.50    0.50   0.205  -      1.5        11.5      11.2..11.8  45.2  49152   99.0      tb
+DepthSplat    -       -         -       19.00    -      -      0.250  -          -         -           -     -       -
 
 frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
 t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes

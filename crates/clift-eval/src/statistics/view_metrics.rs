@@ -1,7 +1,9 @@
 //! The metrics of a view, and the key of a row in tables and files.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
+use clift_core::mean;
 use clift_model::TokenCoding;
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +40,19 @@ impl EvalKey {
     }
 }
 
+impl fmt::Display for EvalKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { method, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
+        f.write_str(method.name())?;
+        match (stored, stored == rendered) {
+            (0, _) => {}
+            (_, true) => write!(f, " {stored}")?,
+            (_, false) => write!(f, " {rendered} of {stored}")?,
+        }
+        tokens.map_or(Ok(()), |tokens| write!(f, " {tokens}"))
+    }
+}
+
 /// Returns the main method among the keys: a condensed method, else K-means, else random tokens, else a
 /// network without clusters.
 pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
@@ -70,11 +85,6 @@ pub struct ViewMetrics {
 }
 
 impl ViewMetrics {
-    /// Returns the PSNR as it counts in a mean, at most [`PSNR_CAP_DB`].
-    pub fn capped_psnr(&self) -> f64 {
-        self.psnr.min(PSNR_CAP_DB)
-    }
-
     /// Returns whether the rendering equals the target.
     pub fn is_identical(&self) -> bool {
         self.psnr == f64::INFINITY
@@ -89,6 +99,19 @@ impl ViewMetrics {
     pub const fn quality(psnr: f64, ssim: Option<f64>) -> Self {
         Self { psnr, ssim, lpips_vgg: None, render_s: None, select_s: None }
     }
+}
+
+/// A value of a view that is averaged; `None` where it was not measured.
+pub(crate) type Metric = fn(&ViewMetrics) -> Option<f64>;
+
+/// PSNR as it counts in a mean, at most [`PSNR_CAP_DB`].
+pub(crate) const PSNR: Metric = |view| Some(view.psnr.min(PSNR_CAP_DB));
+pub(crate) const SSIM: Metric = |view| view.ssim;
+pub(crate) const LPIPS: Metric = |view| view.lpips_vgg;
+
+/// Returns the mean over the views of a scene that have the metric, by target frame; `None` without one.
+pub(crate) fn view_mean(views: &BTreeMap<usize, ViewMetrics>, metric: Metric) -> Option<f64> {
+    mean(&views.values().filter_map(metric).collect::<Vec<_>>())
 }
 
 /// Cost of a key, the same for every view; `None` was not computed.

@@ -16,7 +16,7 @@ use crate::sweep::compressed_tokens::CompressedTokens;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
-use crate::sweep::sweep::{Sweep, render_counts};
+use crate::sweep::sweep::Sweep;
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
 use crate::system::memory;
@@ -95,7 +95,7 @@ fn add_jobs<'a>(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    for &count in &sweep.stored_tokens {
+    for &count in &sweep.eval.stored_tokens {
         let num_storage_tokens = count.of(num_tokens)?;
         let clusters = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
         let own_norm: Vec<_> = normed
@@ -104,10 +104,10 @@ fn add_jobs<'a>(
                 (*of, lift, LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed))
             })
             .collect();
-        for &method in sweep.methods.iter().filter(|method| method.network().is_none()) {
+        for &method in sweep.eval.methods.iter().filter(|method| method.network().is_none()) {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
             let (lift, clusters) = own.map_or((&lift, &clusters), |(_, lift, clusters)| (*lift, clusters));
-            for (i, coding) in sweep.formats(method).into_iter().enumerate() {
+            for (i, coding) in sweep.eval.formats_of(method).into_iter().enumerate() {
                 let kept_views = if i == 0 { kept_views } else { &[] };
                 let stored =
                     CompressedTokens::new(method, models, (lift, clusters), coding, (clip, &sweep.model_path))?;
@@ -117,12 +117,12 @@ fn add_jobs<'a>(
                 let all = RenderJob::new(whole, &stored, None, kept_views);
                 renderer.warm_up(&all, metrics)?;
                 jobs.push(all);
-                for num_render_tokens in render_counts(&sweep.render, num_storage_tokens) {
+                for num_render_tokens in sweep.eval.render_counts(num_storage_tokens) {
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
-                    metrics.selection = Some(sweep.selection);
+                    metrics.selection = Some(sweep.eval.selection);
                     let selected =
-                        select_for_views(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
+                        select_for_views(sweep.eval.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
                     if !kept_views.is_empty() {
                         results.selections.push((some, stored.ids.clone(), selected.clone()));
                     }
@@ -156,11 +156,11 @@ fn add_whole_jobs<'a>(
     let TargetRenderer { clip, sweep, .. } = *renderer;
     for model in &models.whole {
         let method = Method::Whole(model.config.architecture);
-        if !sweep.methods.contains(&method) {
+        if !sweep.eval.methods.contains(&method) {
             continue;
         }
         let tokens = model.network.encode(context);
-        for (i, coding) in sweep.formats(method).into_iter().enumerate() {
+        for (i, coding) in sweep.eval.formats_of(method).into_iter().enumerate() {
             let TokenCoding::Plain(format) = coding else { continue };
             let stored = CompressedTokens::whole(model, tokens.clone(), format, clip.context.num_views())?;
             let count = tokens.dims()[1];

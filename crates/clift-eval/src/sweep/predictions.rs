@@ -47,7 +47,7 @@ impl ExternalMethod {
                 let pixels = read_image(&path, clip.target.height, clip.target.width)?;
                 scored.add(view, pixels, scorer, kept_views)?;
             } else {
-                results.record_missing_image(self.name, image_name(&clip.key, frame));
+                results.record_missing_image(scored.key.method, image_name(&clip.key, frame));
             }
         }
         if let Some(bytes) = self.data_bytes {
@@ -140,7 +140,7 @@ mod tests {
         // 51 of 255 levels: a fifth.
         assert!((scored.metrics[&2].psnr - -20.0 * 0.2_f64.log10()).abs() < 1e-5);
         assert_eq!(scored.images.keys().copied().collect::<Vec<_>>(), [2]);
-        let missing = &into.missing[&MethodName::new("MVSplat").unwrap()];
+        let missing = &into.missing[&"MVSplat".parse().unwrap()];
         assert_eq!(missing.iter().collect::<Vec<_>>(), ["a_room/000012.png"]);
         std::fs::write(folder.path().join("a_room/000012.png"), "no image").unwrap();
         let error = external(folder.path()).score(&clip, &scorer, &[], &mut into).err().unwrap().to_string();

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clift_core::derive_seed;
 use clift_data::DataConfig;
-use clift_eval::{EvalConfig, Method, PERCEPTUAL_COMMAND, Sweep};
+use clift_eval::{EvalConfig, PERCEPTUAL_COMMAND, Sweep};
 use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCount};
 use serde::{Deserialize, Serialize};
 
@@ -93,22 +93,18 @@ impl Config {
         }
     }
 
-    /// Returns the settings of an evaluation, without LPIPS and external methods.
-    pub(crate) fn sweep(&self, stored_tokens: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
-        let Self { seed, eval, clusters, model, device, .. } = self;
+    /// Returns the settings of an evaluation by `eval`, without LPIPS and external methods.
+    pub(crate) fn sweep(&self, eval: EvalConfig) -> Sweep {
+        let Self { seed, clusters, model, device, .. } = self;
         Sweep {
-            min_timed_views: 0,
-            stored_tokens,
-            render: eval.render.clone(),
-            selection: eval.selection,
-            formats: eval.formats.clone(),
-            methods,
+            eval,
             model_path: self.run_dir.display().to_string(),
             kmeans: clusters.kmeans.clone(),
             model: model.clone(),
             lpips: None,
             external_methods: Vec::new(),
             is_cpu: device.is_cpu(),
+            min_timed_views: 0,
             seed: derive_seed(*seed, "eval"),
         }
     }

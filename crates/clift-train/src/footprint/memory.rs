@@ -7,7 +7,7 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::{RunStep, Stage};
 use crate::footprint::scene_sizes::{
-    VIEWS_PER_PASS, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips, num_patches, num_tokens,
+    VIEWS_PER_PASS, cluster_counts, image_values, largest_sizes, measures_lpips, num_patches, num_tokens, planned_eval,
     scene_with_all_tokens,
 };
 
@@ -121,8 +121,8 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let supports_clusters = config.model.architecture.supports_clusters();
     let second_renderer = if supports_clusters { parameters.renderer } else { 0 };
     let scene = scene_with_all_tokens(config, eval.num_context, 0)?;
-    let sweep = eval_sizes(config);
-    let num_rendered: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
+    let planned = planned_eval(config);
+    let num_rendered: usize = stored.iter().map(|&count| planned.token_counts(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {
         // Each of two stages has a renderer.

@@ -15,7 +15,7 @@ use crate::error::TrainError;
 use crate::events::{RunStep, Stage};
 use crate::footprint::memory::peak_bytes;
 use crate::footprint::scene_sizes::{
-    eval_sizes, num_tokens, possible_sizes, scene_with_all_tokens, scene_with_stored_tokens,
+    num_tokens, planned_eval, possible_sizes, scene_with_all_tokens, scene_with_stored_tokens,
 };
 use crate::stage::settings::StageSettings;
 
@@ -178,13 +178,13 @@ fn clusters(config: &Config) -> Result<PartPlan, TrainError> {
 fn evaluation(config: &Config) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
     let scene = scene_with_all_tokens(config, eval.num_context, eval.num_targets)?;
-    let sweep = eval_sizes(config);
+    let planned = planned_eval(config);
     let mut macs = part_macs(&config.model, Part::Encoder, &scene);
     for count in config.eval_stored_tokens() {
         let count = count.of(scene.num_tokens)?;
         let scene = scene_with_stored_tokens(scene, count);
         macs += part_macs(&config.model, Part::Condenser, &scene);
-        for num_render_tokens in sweep.token_counts(count) {
+        for num_render_tokens in planned.token_counts(count) {
             let scene = SceneSizes { num_render_tokens, ..scene };
             let of_views = config.model.render_views_macs(config.data.height, config.data.width, &scene)?;
             macs += of_views.count(FlopConvention::Macs) as f64;

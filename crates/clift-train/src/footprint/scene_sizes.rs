@@ -1,6 +1,6 @@
 //! Sizes of the steps of a run: all possible ones, the largest.
 
-use clift_eval::{LPIPS_MIN_SIZE_PX, Method, Sweep};
+use clift_eval::{EvalConfig, LPIPS_MIN_SIZE_PX, Method};
 use clift_model::SceneSizes;
 
 use crate::config::config::Config;
@@ -45,20 +45,19 @@ pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainE
     Ok(SceneSizes { num_render_tokens: count, is_per_view, ..scene })
 }
 
-/// Returns the settings of an evaluation: the methods of the config, or those for which a run has weights.
-pub fn eval_sizes(config: &Config) -> Sweep {
+/// Returns the settings of an evaluation with the methods that a run has weights for, of those of the config.
+pub fn planned_eval(config: &Config) -> EvalConfig {
     let architecture = config.model.architecture;
-    if !architecture.supports_clusters() {
-        return config.sweep(config.eval_stored_tokens(), vec![Method::Whole(architecture)]);
-    }
     let condensed = Method::condensed(config.clusters.grouping);
     let mut methods = config.eval.methods.clone();
     // The condenser of another grouping belongs to another run.
     methods.retain(|method| !method.is_condensed() || *method == condensed);
-    if methods.is_empty() {
+    if !architecture.supports_clusters() {
+        methods = vec![Method::Whole(architecture)];
+    } else if methods.is_empty() {
         methods = vec![Method::Random, Method::Kmeans, condensed];
     }
-    config.sweep(config.eval.stored_tokens.clone(), methods)
+    EvalConfig { methods, ..config.eval.clone() }
 }
 
 /// Whether an evaluation measures LPIPS.

@@ -59,8 +59,7 @@ impl<'a> Validation<'a> {
             device: config.device.to_string(),
             command: std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect::<Vec<_>>().join(" "),
         };
-        let sweep = config.sweep(eval.stored_tokens.clone(), Vec::new());
-        let evaluator = Evaluator::new(eval, sweep, description, reader, frames, device)?;
+        let evaluator = Evaluator::new(config.sweep(eval), description, reader, frames, device)?;
         if !evaluator.skip_report.skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report)));
         }
@@ -98,32 +97,33 @@ impl<'a> Validation<'a> {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Option<f64>, TrainError> {
-        let Config { eval, clusters, model: sizes, .. } = self.config;
+        let Config { eval: settings, clusters, model: sizes, .. } = self.config;
         let is_stage2 = stage == Stage::Stage2;
         let model = TrainedModel::snapshot(model, sizes, is_stage2);
         let mut models = EvalModels::new(model.clone());
         let (stored_tokens, method) = if is_stage2 {
             models.set_stage2(clusters.grouping, model);
-            (eval.validation_stored_tokens, Method::condensed(clusters.grouping))
+            (settings.validation_stored_tokens, Method::condensed(clusters.grouping))
         } else {
             let architecture = sizes.architecture;
             let method = if architecture.supports_clusters() { Method::Kmeans } else { Method::Whole(architecture) };
             (TokenCount::Share(1.0), method)
         };
         let all = &self.evaluator.sweep;
-        let sweep = Sweep {
+        let eval = EvalConfig {
             stored_tokens: vec![stored_tokens],
             render: Vec::new(),
             formats: vec![TokenCoding::F32],
             methods: vec![method],
-            ..all.clone()
+            ..all.eval.clone()
         };
+        let sweep = Sweep { eval, ..all.clone() };
         let mut write_sheet = |_: &str, figures: SceneFigures| {
             let making = |source| EvalError::Io { action: "making a folder", source, path: folder.into() };
             std::fs::create_dir_all(folder).map_err(making)?;
             figures.contact_sheet.write_png(&folder.join(format!("step-{step:09}.png")))
         };
-        let limits = SceneLimits { num_scenes: eval.num_validation_scenes, num_figures: 1 };
+        let limits = SceneLimits { num_scenes: settings.num_validation_scenes, num_figures: 1 };
         let mut progress = EvalEvents { stop, sink, ranks, is_stage: false };
         let measured = match self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, &mut progress) {
             Err(EvalError::Interrupted { .. }) => return Ok(None),
@@ -131,9 +131,9 @@ impl<'a> Validation<'a> {
         };
         let summary = Summary::new(&measured);
         let Some(point) = summary.points.first() else { return Ok(None) };
-        let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
+        let (psnr, ssim) = (point.quality.psnr.unwrap_or(f64::NAN), point.quality.ssim);
         sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
-        Ok(point.psnr.filter(|psnr| psnr.is_finite()))
+        Ok(point.quality.psnr.filter(|psnr| psnr.is_finite()))
     }
 
     /// Evaluates models on the views of this validation, the scenes shared by the ranks.

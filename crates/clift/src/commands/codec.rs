@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::{ClipReader, Split};
-use clift_eval::{EvalFrames, EvalSplit, FittedCodec};
+use clift_eval::{EvalFrames, EvalSplit, FittedCodec, table};
 use clift_model::TokenCodec;
 use clift_train::fit_token_codec;
 
@@ -15,7 +15,6 @@ use crate::interrupt;
 use crate::output::output_file::OutputFile;
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 
 #[derive(Debug, clap::Args)]
 pub struct CodecArgs {

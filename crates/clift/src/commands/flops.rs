@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
+use clift_eval::table;
 use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
 use clift_train::{Config, check_plan};
 use serde::Serialize;
 
 use crate::commands::args::shared_args::{JsonArg, read_config};
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 
 /// Token counts of the paper's table of rendering costs.
 const PAPER_TOKENS: [usize; 5] = [4096, 3072, 2048, 1024, 512];

@@ -15,10 +15,17 @@ use crate::output::tensorboard::{Scalar, event_file};
 
 /// Stages with curves.
 const STAGES: [Stage; 2] = [Stage::Stage1, Stage::Stage2];
-/// Columns of a step, as in `metrics.jsonl`.
-const STEP_KEYS: [&str; 5] = ["loss", "psnr", "lr", "grad_norm", "step_s"];
-/// Columns of a validation, as in `validation.jsonl`.
-const VALIDATION_KEYS: [&str; 3] = ["psnr", "ssim", "num_views"];
+/// Columns of the CSV with their TensorBoard tags: keys of `metrics.jsonl`, then those of `validation.jsonl` with a prefix.
+const CURVES: [(&str, Option<&str>); 8] = [
+    ("loss", Some("train/loss")),
+    ("psnr", Some("train/psnr")),
+    ("lr", Some("train/learning_rate")),
+    ("grad_norm", Some("train/grad_norm")),
+    ("step_s", Some("train/step_s")),
+    ("validation_psnr", Some("validation/psnr")),
+    ("validation_ssim", Some("validation/ssim")),
+    ("validation_num_views", None),
+];
 
 /// A line of either file.
 #[derive(Debug, Deserialize)]
@@ -35,8 +42,8 @@ struct Line {
 #[derive(Debug, Default)]
 struct Row {
     time: f64,
-    step: BTreeMap<String, Option<f64>>,
-    validation: BTreeMap<String, Option<f64>>,
+    /// Values by column.
+    values: BTreeMap<String, Option<f64>>,
 }
 
 /// Rows by stage and step.
@@ -65,7 +72,8 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<()> {
 
 fn read_rows(run: &Path) -> anyhow::Result<Rows> {
     let mut rows = Rows::new();
-    for (name, is_step) in [("metrics.jsonl", true), ("validation.jsonl", false)] {
+    for (name, prefix) in [("metrics.jsonl", ""), ("validation.jsonl", "validation_")] {
+        let is_step = prefix.is_empty();
         let path = run.join(name);
         // Runs without validation lack the second.
         if !is_step && !path.exists() {
@@ -79,26 +87,20 @@ fn read_rows(run: &Path) -> anyhow::Result<Rows> {
             let line: Line = serde_json::from_str(line).with_context(bad)?;
             let row = rows.entry((line.stage, line.step)).or_default();
             if is_step {
-                (row.time, row.step) = (line.time, line.values);
-            } else {
-                row.validation = line.values;
+                row.time = line.time;
             }
+            row.values.extend(line.values.into_iter().map(|(key, value)| (format!("{prefix}{key}"), value)));
         }
     }
     Ok(rows)
 }
 
 fn csv(rows: &Rows) -> Vec<u8> {
-    let mut text = format!("stage,step,time,{}", STEP_KEYS.join(","));
-    for key in VALIDATION_KEYS {
-        let _ = write!(text, ",validation_{key}");
-    }
-    text.push('\n');
+    let mut text = format!("stage,step,time,{}\n", CURVES.map(|(column, _)| column).join(","));
     for ((stage, step), row) in rows {
         let _ = write!(text, "{},{step},{}", stage.name(), row.time);
-        let cells = STEP_KEYS.iter().map(|key| (&row.step, key));
-        for (values, key) in cells.chain(VALIDATION_KEYS.iter().map(|key| (&row.validation, key))) {
-            let value = values.get(*key).copied().flatten();
+        for (column, _) in CURVES {
+            let value = row.values.get(column).copied().flatten();
             text += &value.map_or_else(|| ",".into(), |value| format!(",{value}"));
         }
         text.push('\n');
@@ -110,22 +112,10 @@ fn csv(rows: &Rows) -> Vec<u8> {
 fn scalars(rows: &Rows, stage: Stage) -> impl Iterator<Item = Scalar<'static>> {
     let of_stage = rows.iter().filter(move |((found, _), _)| *found == stage);
     of_stage.flat_map(|(&(_, step), row)| {
-        let tags = [
-            ("train/loss", &row.step, "loss"),
-            ("train/psnr", &row.step, "psnr"),
-            ("train/learning_rate", &row.step, "lr"),
-            ("train/grad_norm", &row.step, "grad_norm"),
-            ("train/step_s", &row.step, "step_s"),
-            ("validation/psnr", &row.validation, "psnr"),
-            ("validation/ssim", &row.validation, "ssim"),
-        ];
-        tags.map(|(tag, values, key)| {
-            let value = values.get(key).map(|value| value.unwrap_or(f64::NAN));
-            value.map(|value| Scalar { tag, step, time: row.time, value })
+        CURVES.into_iter().filter_map(move |(column, tag)| {
+            let value = row.values.get(column)?.unwrap_or(f64::NAN);
+            Some(Scalar { tag: tag?, step, time: row.time, value })
         })
-        .into_iter()
-        .flatten()
-        .collect::<Vec<_>>()
     })
 }
 

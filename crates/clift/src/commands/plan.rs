@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
+use clift_eval::table;
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PartPlan, Plan, check_plan, largest_tensor, memory_warning, plan};
 
 use crate::commands::args::parse::parse_count;
 use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 use crate::output::stdout::{print_result, print_warning};
-use crate::output::table::table;
 use crate::output::units::{file_size, memory_size};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {

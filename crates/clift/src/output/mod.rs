@@ -2,7 +2,6 @@
 //!
 //! - `units`: seconds, bytes, counts
 //! - `visible`: control characters escaped
-//! - `table`: aligned columns
 //! - `output_file`: files that are written, checked beforehand
 //! - `tensorboard`: event files
 //! - `verbosity`: `--quiet` and `--verbose`
@@ -20,7 +19,6 @@ pub(crate) mod output_file;
 pub(crate) mod plain;
 pub(crate) mod progress_sink;
 pub(crate) mod stdout;
-pub(crate) mod table;
 pub(crate) mod tensorboard;
 pub(crate) mod units;
 pub(crate) mod verbosity;

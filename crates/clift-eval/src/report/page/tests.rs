@@ -180,7 +180,7 @@ fn external_methods_are_escaped_everywhere_and_missing_images_noted() {
     let key = EvalKey::baseline(Method::External(name));
     results.add("a", 3, key, ViewMetrics::quality(17.0, Some(0.5))).unwrap();
     results.add_scene_bytes(key, 5_000);
-    results.record_missing_image(name, "b/000003.png".into());
+    results.record_missing_image(Method::External(name), "b/000003.png".into());
     results.note_not_measured("lpips_vgg", "no <weights>".into());
     let summary = Summary::new(&results);
     other.summary.points.extend(summary.points);

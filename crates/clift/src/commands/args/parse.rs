@@ -10,7 +10,8 @@ use clift_train::{ExportFormat, RunStep, Stage};
 pub(crate) fn parse_methods(text: &str) -> Result<[MethodFilter; 2], String> {
     let parts: Vec<&str> = text.split(',').map(str::trim).filter(|part| !part.is_empty()).collect();
     let [a, b] = parts[..] else { return Err("write two methods, e.g. kmeans,clift".into()) };
-    Ok([MethodFilter::parse(a), MethodFilter::parse(b)])
+    let side = |text| MethodFilter::parse(text).map_err(|error| error.to_string());
+    Ok([side(a)?, side(b)?])
 }
 
 /// Parses a number of bytes with an optional decimal unit, as `12.5MB`.

@@ -2,11 +2,12 @@
 
 use clift_bench::{AllReduceReport, AllReduceRow, measure_allreduce};
 
+use clift_eval::table;
+
 use crate::commands::args::parse::parse_count;
 use crate::commands::args::shared_args::JsonArg;
 use crate::commands::ranks::{connect, finish};
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 use crate::output::units::{file_size, seconds};
 
 #[derive(Debug, clap::Args)]

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchReport, BenchRow, MAX_CHECKED_TOKENS, run_bench};
+use clift_eval::table;
 use clift_model::Precision;
 
 use crate::commands::bench::allreduce::BenchAllReduceArgs;
@@ -13,7 +14,6 @@ use crate::commands::bench::timing_args::TimingArgs;
 use crate::interrupt;
 use crate::output::counter::Counter;
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 use crate::output::units::{memory_size, seconds};
 
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {

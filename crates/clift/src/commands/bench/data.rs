@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clift_bench::{Throughput, ThroughputOptions, measure_reading};
 use clift_core::{PoseRotation, PoseScale};
 use clift_data::{ClipOptions, FileOptions};
-use clift_eval::{peak_bytes, start_peak};
+use clift_eval::{peak_bytes, start_peak, table};
 use serde::Serialize;
 
 use crate::commands::args::parse::{parse_size, parse_views};
@@ -13,7 +13,6 @@ use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{Splits, open_splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 use crate::output::units::{memory_size, seconds};
 
 #[derive(Debug, clap::Args)]

@@ -4,10 +4,11 @@ use std::path::PathBuf;
 
 use clift_bench::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precision};
 
+use clift_eval::table;
+
 use crate::commands::bench::timing_args::TimingArgs;
 use crate::interrupt;
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 use crate::output::units::seconds;
 
 #[derive(Debug, clap::Args)]

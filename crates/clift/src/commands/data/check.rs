@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clift_data::{
     CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, skipped_scenes,
 };
-use clift_eval::file_name;
+use clift_eval::{file_name, table};
 use serde::Serialize;
 
 use crate::commands::args::shared_args::JsonArg;
@@ -13,7 +13,6 @@ use crate::commands::args::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
-use crate::output::table::table;
 use crate::output::visible::visible_line;
 
 #[derive(Debug, Serialize)]

@@ -1,8 +1,8 @@
 //! Table of the GPU adapters for `wgpu`, with their limits.
 
+use clift_eval::table;
 use clift_model::{ADAPTER_VARIABLE, Adapter, adapters};
 
-use crate::output::table::table;
 use crate::output::units::memory_size;
 
 /// Formats the adapters with their limits, or the reason why there are none; `None` in a build without `wgpu`.

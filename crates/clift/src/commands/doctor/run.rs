@@ -3,14 +3,13 @@
 use std::path::PathBuf;
 
 use clift_bench::{DeviceCheck, Gradient, probe};
-use clift_eval::machine_rows;
+use clift_eval::{machine_rows, table};
 use clift_model::{DeviceName, InstructionSet, Precision};
 
 use crate::commands::args::parse::parse_output;
 use crate::commands::doctor::{adapters, stability};
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
-use crate::output::table::table;
 
 /// Largest accepted difference of a gradient over its largest entry: orders of sums differ by 1e-6, wrong kernels by 1.
 const TOLERANCE: f64 = 1e-3;
@@ -110,12 +109,13 @@ fn check(probe: DeviceCheck, reference: Option<&DeviceCheck>, tolerance: f64) ->
     }
 }
 
+/// Returns the cells of a device, and the reason of a failure.
 fn row(
     name: DeviceName,
     precision: Precision,
     probed: Result<&DeviceCheck, &String>,
     reference: Option<&DeviceCheck>,
-) -> [String; 6] {
+) -> ([String; 6], Option<String>) {
     let is_default = name == DeviceName::default() && precision == Precision::F32;
     let dash = || "-".to_owned();
     let device = match precision {
@@ -124,8 +124,11 @@ fn row(
         Precision::Bf16 | Precision::F16 => format!("{name}, {precision}"),
     };
     match probed {
-        Err(_) if !name.is_built() => [device, "not built".into(), dash(), dash(), dash(), dash()],
-        Err(reason) => [device, format!("FAILED: {reason}"), dash(), dash(), dash(), dash()],
+        Err(_) if !name.is_built() => ([device, "not built".into(), dash(), dash(), dash(), dash()], None),
+        Err(reason) => {
+            let failure = format!("{device}: {reason}");
+            ([device, "FAILED".into(), dash(), dash(), dash(), dash()], Some(failure))
+        }
         Ok(DeviceCheck { adapter, dtypes, gradient, seconds }) => {
             let difference = match reference {
                 _ if is_default => "reference".into(),
@@ -133,22 +136,16 @@ fn row(
                 None => dash(),
             };
             let time = format!("{:.1} ms", seconds * 1e3);
-            [device, "ok".into(), adapter.clone(), dtypes.join(" "), time, difference]
+            ([device, "ok".into(), adapter.clone(), dtypes.join(" "), time, difference], None)
         }
     }
 }
 
 /// Formats the rows, with the reasons of failures below the table.
-fn device_table(mut rows: Vec<[String; 6]>) -> String {
-    let mut failures = Vec::new();
-    for [device, state, ..] in &mut rows {
-        if let Some(reason) = state.strip_prefix("FAILED: ") {
-            failures.push(format!("{device}: {reason}"));
-            *state = "FAILED".into();
-        }
-    }
+fn device_table(rows: Vec<([String; 6], Option<String>)>) -> String {
+    let (rows, failures): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
     let table = table(["device", "state", "adapter", "dtypes", "fwd+bwd", "gradient difference"], rows);
-    [table].into_iter().chain(failures).collect::<Vec<_>>().join("\n")
+    [table].into_iter().chain(failures.into_iter().flatten()).collect::<Vec<_>>().join("\n")
 }
 
 #[derive(Debug, clap::Args)]

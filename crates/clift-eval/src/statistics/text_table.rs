@@ -1,11 +1,13 @@
-//! Tables of aligned columns.
+//! Tables of aligned columns for terminals.
 
-use crate::output::visible::visible_line;
-
-/// Formats a header and rows in columns of equal width, two spaces apart.
+/// Formats a header and rows in columns of equal width, two spaces apart. Escapes control characters, such as those of scene
+/// keys, which a terminal would execute.
 pub fn table<const COUNT: usize>(header: [&str; COUNT], rows: impl IntoIterator<Item = [String; COUNT]>) -> String {
+    let visible = |cell: String| {
+        if cell.contains(char::is_control) { cell.escape_debug().to_string() } else { cell }
+    };
     let rows = [header.map(String::from)].into_iter().chain(rows);
-    let rows: Vec<_> = rows.map(|row| row.map(|cell| visible_line(&cell).into_owned())).collect();
+    let rows: Vec<[String; COUNT]> = rows.map(|row| row.map(visible)).collect();
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0) + 2;
     let widths: [usize; COUNT] = std::array::from_fn(width);
     let line = |row: &[String; COUNT]| {
