@@ -63,8 +63,8 @@ fn features_of_a_file_have_their_own_number_of_tokens() {
 fn an_interrupted_benchmark_writes_nothing() {
     let place = Place::new();
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
-        // A thousand repetitions: the second row lasts until the signal arrives.
-        let long = "--case encode,render --no-error --repeats 1000 --json DIR/bench.json";
+        // Thousands of repetitions: the second row lasts until the signal arrives.
+        let long = "--case encode,render --no-error --repeats 3000 --json DIR/bench.json";
         let mut child = place.start(&format!("{BENCH} {long}"));
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
         assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");
