@@ -124,15 +124,17 @@ fn an_evaluation_can_be_interrupted() {
 
 #[test]
 fn resumed_runs_need_neither_initial_weights_nor_clusters() {
-    let place = Place::new();
-    place.copy(&STAGE_1, "first");
-    let from = format!("stage1.init_from=\"{}\"", place.at("first").display());
-    place.kill_at("saved/stage1/2", "second", &[&from]);
-    std::fs::remove_dir_all(place.at("first")).expect("removes");
-    place.train("second", &[&from]).ok();
-    std::fs::remove_dir_all(place.at("second/clusters")).expect("removes");
-    place.train("second", &[&from]).ok();
-    assert!(!place.at("second/clusters").exists(), "nothing was clustered again");
+    for (first, stage) in [(&STAGE_1, "stage1"), (&WHOLE, "stage2")] {
+        let place = Place::new();
+        place.copy(first, "first");
+        let from = format!("{stage}.init_from=\"{}\"", place.at("first").display());
+        place.kill_at(&format!("saved/{stage}/2"), "run", &[&from]);
+        std::fs::remove_dir_all(place.at("first")).expect("removes");
+        place.train("run", &[&from]).ok();
+        std::fs::remove_dir_all(place.at("run/clusters")).expect("removes");
+        place.train("run", &[&from]).ok();
+        assert!(!place.at("run/clusters").exists(), "nothing was clustered again");
+    }
 }
 
 #[test]
@@ -140,16 +142,6 @@ fn a_begun_run_without_its_config_is_refused() {
     let place = Place::with(&STAGE_1);
     std::fs::remove_file(place.at("run/config.toml")).expect("removes");
     place.train("run", &["seed=1"]).fails_with(1, &["config.toml", "start a new run with --fresh"]);
-}
-
-#[test]
-fn resumed_stage_2_needs_no_initial_weights() {
-    let place = Place::new();
-    place.copy(&WHOLE, "first");
-    let from = format!("stage2.init_from=\"{}\"", place.at("first").display());
-    place.kill_at("saved/stage2/2", "run", &[&from]);
-    std::fs::remove_dir_all(place.at("first")).expect("removes");
-    place.train("run", &[&from]).ok();
 }
 
 #[test]
