@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Attacks every reader with damaged files, by default ten minutes each:
-#   bash scripts/check/attack.sh [SECONDS] [more arguments of clift-attack: --seed 3, --target pickle, --markdown FILE]
+#   bash scripts/check/attack.sh [SECONDS] [more arguments of clift-attack: --seed 3, --target pickle]
 #
 # What is found lies in findings/ afterwards, and the command that shows it again is
 #   clift-attack --target NAME --seed SEED --first NUMBER --count 1

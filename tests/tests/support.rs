@@ -109,6 +109,20 @@ pub fn wait_until(child: &mut Child, what: &str, is_there: impl Fn() -> bool) {
     }
 }
 
+/// A value in [0, 1), the same in every test run (the upper bits of an LCG).
+pub fn draw(state: &mut u64) -> f64 {
+    *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+    (*state >> 33) as f64 / (1_u64 << 31) as f64
+}
+
+/// Waits for a time, or until the child has ended.
+pub fn wait_at_most(time: Duration, child: &mut Child) {
+    let until = Instant::now() + time;
+    while Instant::now() < until && child.try_wait().expect("a child").is_none() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
 pub fn finish(child: Child) -> Ran {
     let output = child.wait_with_output().expect("the binary under test ends");
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("it prints UTF-8");

@@ -215,6 +215,8 @@ pub(crate) mod tests {
                     matches!(row.case, BenchCase::Select | BenchCase::CodeTokens | BenchCase::DecodeTokens);
                 assert_eq!(close, (!is_on_host).then_some(true), "{device}: {row:?}");
                 assert_eq!(row.samples_s.len(), 2);
+                assert!(row.median_s > 0.0 && row.p95_s >= row.median_s, "{row:?}");
+                assert!(row.peak_bytes.is_none_or(|bytes| bytes > 1 << 20), "{row:?}");
                 assert!(row.samples_s.iter().all(|sample| (0.0..=row.p95_s).contains(sample)));
                 assert_eq!(row.inertia.is_some(), row.case == BenchCase::Kmeans);
             }

@@ -64,7 +64,7 @@ mod tests {
         check::<SelectionPreset>("paper, global, scaled");
         check::<CliftVariant>("paper, released-re10k, released-dl3dv");
         assert_eq!(names::<TokenFormat>(), "f32, f16, int8");
-        assert_eq!(names::<TokenKind>(), "clift, kmeans, all");
+        assert_eq!(names::<TokenKind>(), "clift, kmeans, latents");
         let message = parse_value::<FlopConvention>("convention", "flop").unwrap_err().to_string();
         assert_eq!(message, "`convention` = flop: write one of paper, macs, flops");
     }

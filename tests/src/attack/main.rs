@@ -20,6 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
+use clap::builder::PossibleValuesParser;
 use mutate::Mutator;
 use report::Attacked;
 use setup::Setup;
@@ -32,7 +33,7 @@ const MOST_SECONDS: u64 = 10;
 #[derive(Debug, Parser)]
 struct Args {
     /// The reader; all of them by default
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = PossibleValuesParser::new(TARGETS.iter().map(|target| target.name)))]
     target: Vec<String>,
     /// Seconds for each reader
     #[arg(long, default_value_t = 20.0)]
@@ -46,29 +47,13 @@ struct Args {
     /// Most executions of each reader
     #[arg(long)]
     count: Option<u64>,
-    /// Write the table as Markdown
-    #[arg(long, value_name = "FILE")]
-    markdown: Option<PathBuf>,
     /// Folder for inputs that found something
     #[arg(long, value_name = "DIR", default_value = "findings")]
     findings: PathBuf,
-    /// Name the readers and stop
-    #[arg(long)]
-    list: bool,
 }
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    if args.list {
-        for target in TARGETS {
-            println!("{}", target.name);
-        }
-        return ExitCode::SUCCESS;
-    }
-    if let Some(unknown) = args.target.iter().find(|name| TARGETS.iter().all(|target| target.name != **name)) {
-        eprintln!("there is no reader {unknown}; --list names them");
-        return ExitCode::from(2);
-    }
     let setup = match Setup::make() {
         Ok(setup) => setup,
         Err(error) => {
@@ -79,19 +64,12 @@ fn main() -> ExitCode {
     let messages = hush_panics();
     watch::start(Duration::from_secs(MOST_SECONDS));
     let chosen = TARGETS.iter().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
-    let mut rows = Vec::new();
+    let mut findings = 0;
     for target in chosen {
         let row = attack(target, &setup, &args, &messages);
         println!("{}", row.line());
-        rows.push(row);
+        findings += row.findings.len();
     }
-    if let Some(path) = &args.markdown
-        && let Err(error) = std::fs::write(path, report::markdown(&rows, args.seconds, args.seed))
-    {
-        eprintln!("{}: {error}", path.display());
-        return ExitCode::FAILURE;
-    }
-    let findings: usize = rows.iter().map(|row| row.findings.len()).sum();
     if findings > 0 {
         println!("{findings} findings; their inputs are in {}", args.findings.display());
         return ExitCode::FAILURE;

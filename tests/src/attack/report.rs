@@ -41,20 +41,3 @@ impl Attacked {
         line
     }
 }
-
-pub fn markdown(rows: &[Attacked], seconds: f64, seed: u64) -> String {
-    let mut text = format!(
-        "`clift-attack --seconds {seconds} --seed {seed}`:\n\n\
-         | reader | executions | accepted | slowest | peak memory | found |\n|---|---|---|---|---|---|\n"
-    );
-    for Attacked { name, executions, accepted, slowest, peak_bytes, findings, .. } in rows {
-        let found = if findings.is_empty() { "nothing".into() } else { findings.join("; ").replace('|', "/") };
-        let _ = writeln!(
-            text,
-            "| {name} | {executions} | {accepted} | {:.1} ms | {:.1} MiB | {found} |",
-            slowest.as_secs_f64() * 1e3,
-            *peak_bytes as f64 / f64::from(1 << 20)
-        );
-    }
-    text
-}

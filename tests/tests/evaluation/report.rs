@@ -6,22 +6,16 @@ use crate::support::{Place, STAGE_1, WHOLE, number};
 fn reports_need_no_other_file() {
     let place = Place::with(&WHOLE);
     let html = place.text("run/eval/report.html");
-    for part in ["<title>run", "synthetic-0-test-00000", "3 of 3 scenes were evaluated", "num_encoder_blocks = 1"] {
-        assert!(html.contains(part), "{part}");
-    }
-    for section in [
-        "Quality and cost",
-        "All points",
-        "Scene by scene",
-        "Images of scenes",
-        "Training",
-        "Skipped scenes",
-        "Command and machine",
-        "Config",
+    for part in [
+        "<title>run",
+        "synthetic-0-test-00000",
+        "3 of 3 scenes were evaluated",
+        "num_encoder_blocks = 1",
+        "validation, step 6: ",
+        "error, 8 tokens",
+        "test split",
+        "micro.toml",
     ] {
-        assert!(html.contains(&format!("<h2>{section}</h2>")), "{section}");
-    }
-    for part in ["validation, step 6: ", "error, 8 tokens", "test split", "micro.toml"] {
         assert!(html.contains(part), "{part}");
     }
     assert!(!html.contains("http") && !html.contains("tokens selected"));
@@ -39,7 +33,7 @@ fn reports_need_no_other_file() {
 #[test]
 fn selected_tokens_have_rows_with_both_times() {
     let place = Place::with(&STAGE_1);
-    for selection in ["paper", "global", "scaled", "random"] {
+    for selection in ["paper", "random"] {
         place.eval(&format!("run --render 2,1/2 --selection {selection} --out DIR/{selection}")).ok();
         let points = place.points(selection);
         let counts = |point: &serde_json::Value| {

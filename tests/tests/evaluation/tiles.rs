@@ -1,20 +1,17 @@
 //! Tiles against K-means, with the same stage 1.
 
-use crate::support::{Place, WHOLE, list, number, point};
+use crate::support::{Place, Shared, WHOLE, list, number, point};
 
 /// At least one tile per view.
 const STORAGE: &str = "eval.validation_stored_tokens=0.5";
 
-/// Trains stage 2 of the run `tiles` on tiles, from the stage 1 of `run`.
-fn train_on_tiles(place: &Place) {
-    let from = format!("stage1.init_from=\"{}\"", place.at("run").display());
-    place.train("tiles", &["stage1.steps=0", &from, "clusters.grouping=\"tile\"", STORAGE]).ok();
-}
+/// The run of tiles, whose stage 1 is that of [`WHOLE`].
+static TILES: Shared = Shared::new("run", &["clusters.grouping=\"tile\"", STORAGE]);
 
 #[test]
 fn tiles_and_clusters_have_paired_differences() {
     let place = Place::with(&WHOLE);
-    train_on_tiles(&place);
+    place.copy(&TILES, "tiles");
     let words = "run --preset patchwise --with DIR/tiles --stored-tokens 1/2 --out DIR/out";
     place.eval(words).ok().prints("kmeans - tile").prints("tile_clift");
     let summary = place.json("out/summary.json");
@@ -42,7 +39,7 @@ fn tiles_and_clusters_have_paired_differences() {
 #[test]
 fn tile_runs_encode_scenes_and_refuse_their_kind() {
     let place = Place::with(&WHOLE);
-    train_on_tiles(&place);
+    place.copy(&TILES, "tiles");
     place
         .train("few", &["clusters.grouping=\"tile\""])
         .fails_with(2, &["eval.validation_stored_tokens", "at least one tile for every context view"]);

@@ -159,7 +159,7 @@ fn targets_that_are_contexts_are_measured() {
 fn unusable_scenes_are_skipped_and_named() {
     /// Makes a data set whose second scene is unusable.
     type Damage = fn(&Place) -> PathBuf;
-    let cases: [(&str, Damage); 6] = [
+    let cases: [(&str, Damage); 5] = [
         ("data/train/000001.torch", |place| {
             let data = two_chunks(place);
             place.truncate("data/train/000001.torch");
@@ -175,7 +175,6 @@ fn unusable_scenes_are_skipped_and_named() {
             changed_scene(place, |scene| scene.images.iter_mut().for_each(|image| image.truncate(image.len() / 2)))
         }),
         ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::NAN)),
-        ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::INFINITY)),
         ("scene 00000000000000a2 has no baseline: its 2 camera centres lie within ", |place| {
             moved_cameras(place, |centre| *centre = [1.0, 2.0, 3.0].into())
         }),

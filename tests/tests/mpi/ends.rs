@@ -4,7 +4,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::engine::{is_running, one_at_a_time, ranks_of, signal, start_train};
-use crate::support::{BINARY, Place, Ran, SmallDisk, finish, start};
+use crate::support::{BINARY, Place, Ran, finish, start};
 
 const LONG: [&str; 4] = ["stage1.steps=4000", "stage2.steps=10", "eval.every=0", "checkpoint={every=50, keep=2}"];
 
@@ -40,22 +40,6 @@ fn a_signal_to_one_rank_saves_the_run() {
     assert!(ran.stderr.contains("error: interrupted at step "), "{}", ran.stderr);
     let steps = place.metrics("run").len() as u64;
     assert_eq!(place.checkpoints("run", "stage1").last(), Some(&steps), "the step is finished and saved");
-}
-
-#[test]
-fn a_full_disk_ends_all_with_one_message() {
-    let _one = one_at_a_time();
-    let place = Place::new();
-    let folder = place.at("disk");
-    let Some(disk) = SmallDisk::mount(&folder, 200) else { return };
-    let set = ["stage1.steps=24", "checkpoint={every=2, keep=20}"];
-    let started = Instant::now();
-    let ran = finish(start_train(&place, 2, "disk/run", &set));
-    assert!(started.elapsed() < Duration::from_secs(30), "{:?}", started.elapsed());
-    assert_eq!(ran.code, Some(1), "{}", ran.stderr);
-    assert_eq!(num_errors(&ran), 1, "{}", ran.stderr);
-    assert!(ran.stderr.contains("No space left on device") && ran.stderr.contains("stage1 stopped"), "{}", ran.stderr);
-    drop(disk);
 }
 
 #[test]

@@ -29,7 +29,8 @@ fn extended_stages_follow_the_longer_schedule() {
     place.train("run", &more).ok();
     assert_eq!(place.json("run/run.json")["extended"], expected);
     // Counts do not shrink.
-    place.train("run --extend", &[]).fails_with(2, &["stage2.steps: 8 -> 4"]);
+    let message = place.train("run --extend", &[]).fails_with(2, &["settings:\n  stage2.steps: 8 -> 4\nresume"]);
+    assert!(!message.contains("continue with --extend"), "{message}");
 }
 
 /// A limit on file sizes stops a write as a full disk does, without the right to mount one.

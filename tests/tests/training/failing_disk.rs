@@ -89,14 +89,14 @@ fn vanished_data_stops_runs_which_resume_with_it() {
         "data={{source='chunks', root='{folder}', width=16, height=16, num_threads=0, \
          views={{min_context=2, max_context=2, min_gap=[3, 3], max_gap=[6, 6], warm_up_steps=0, num_targets=2}}}}"
     );
-    let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=1000, keep=2}", source.as_str()];
+    let set = ["stage1.steps=200", "eval.every=0", "checkpoint={every=1000, keep=2}", source.as_str()];
     place.train("whole", &set).ok();
     let mut child = place.start_train("run", &set);
     place.wait_for_steps("run", &mut child, 5);
     std::fs::rename(&data, place.at("gone")).expect("renames");
     let message = finish(child).fails_with(1, &["no usable scene for slot ", "000000.torch"]);
     let steps = place.metrics("run").len() as u64;
-    assert!((5..400).contains(&steps), "{steps}");
+    assert!((5..200).contains(&steps), "{steps}");
     assert!(message.contains(&format!("\nstage1 stopped after step {steps}; ")), "{message}");
     place.assert_names_last_checkpoint("run", steps, &message);
 

@@ -1,6 +1,6 @@
 //! Effects of hyper-parameters on the weights.
 
-use crate::support::{Place, Weights};
+use crate::support::{Place, WHOLE, Weights};
 
 /// Root mean square change of all values.
 fn rms_move(after: &Weights, before: &Weights) -> f64 {
@@ -47,7 +47,7 @@ fn stage_2_saves_weights_between_its_start_and_its_end() {
             }
         }
     };
-    place.train("whole", &[]).ok();
+    place.copy(&WHOLE, "whole");
     place.train("new", &[between]).ok().notes("saving the weights at 0.25 of the way from its start");
     let [stage1, whole] = ["stage1", "stage2"].map(|stage| place.weights("whole", stage));
     assert_between("new", &stage1, &whole);

@@ -2,25 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::Value;
-
 use crate::support::{Place, Ran, STAGE_1, WHOLE, list, number};
-
-/// Keys of a JSON object, in any order.
-fn keys(value: &Value) -> Vec<&str> {
-    let mut keys: Vec<&str> = value.as_object().expect("an object").keys().map(String::as_str).collect();
-    keys.sort_unstable();
-    keys
-}
-
-const SUMMARY_KEYS: &str = "\
-    baselines differences lpips_weights_sha256 missing not_measured num_context_targets num_scenes num_skipped \
-    num_views points selection split";
-
-const POINT_KEYS: &str = "\
-    frame_median_s frame_p95_s frame_quartiles_s gflops lpips_vgg lpips_vgg_per_view method num_identical_views \
-    num_render_tokens num_storage_tokens num_views pareto_bytes pareto_time peak_bytes psnr psnr_per_view psnr_stderr \
-    render_median_s render_p95_s render_s scene_bytes scene_values select_s ssim ssim_per_view tokens";
 
 #[test]
 fn a_run_writes_every_documented_file() {
@@ -46,7 +28,6 @@ fn a_run_writes_every_documented_file() {
     let expected = (1..=6).map(|step| ("stage1", step)).chain((1..=4).map(|step| ("stage2", step)));
     assert_eq!(steps.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
     for line in &lines {
-        assert_eq!(keys(line), ["grad_norm", "loss", "lr", "psnr", "stage", "step", "step_s", "time"]);
         let number = |key: &str| number(line, key);
         assert!(number("loss") > 0.0 && number("grad_norm") > 0.0 && number("step_s") > 0.0, "{line}");
         // Written from the same f64 to the last digit.
@@ -58,7 +39,6 @@ fn a_run_writes_every_documented_file() {
     let expected = [("stage1", 3), ("stage1", 6), ("stage2", 3), ("stage2", 4)];
     assert_eq!(steps.collect::<Vec<_>>(), expected, "eval.every = 3");
     for line in &validations {
-        assert_eq!(keys(line), ["num_views", "psnr", "ssim", "stage", "step", "time"]);
         assert!(number(line, "psnr") > 5.0 && line["num_views"] == 2, "{line}");
     }
     // Warm-up of two steps to 1e-3, then half a cosine to nothing at step 6.
@@ -67,12 +47,9 @@ fn a_run_writes_every_documented_file() {
 
     let summary = place.json("run/eval/summary.json");
     assert_eq!(summary["split"], "test");
-    assert_eq!(keys(&summary).join(" "), SUMMARY_KEYS);
     assert_eq!(["num_scenes", "num_views", "num_skipped"].map(|key| summary[key].as_u64()), [3, 6, 0].map(Some));
-    assert_eq!(keys(&summary["baselines"]), ["mean_image", "nearest_view"]);
     for baseline in ["mean_image", "nearest_view"] {
         let baseline = &summary["baselines"][baseline];
-        assert_eq!(keys(baseline), ["lpips_vgg", "num_identical_views", "psnr", "ssim"]);
         assert!(number(baseline, "psnr") > 5.0 && baseline["ssim"].is_f64(), "{baseline}");
     }
     let points = list(&summary["points"]);
@@ -80,7 +57,6 @@ fn a_run_writes_every_documented_file() {
     let expected = ["clift", "kmeans", "random"].map(|variant| [4, 8].map(|count| (Some(variant), Some(count))));
     assert_eq!(settings.collect::<Vec<_>>(), expected.concat());
     for point in points {
-        assert_eq!(keys(point).join(" "), POINT_KEYS);
         assert_eq!(point["num_render_tokens"], point["num_storage_tokens"]);
         assert!(point["psnr"].is_f64() && point["psnr_stderr"].is_f64() && point["ssim"].is_f64(), "{point}");
     }

@@ -36,7 +36,7 @@ fn browser_turns_the_camera_and_renders_its_exported_path() {
     let Some(mut browser) = browser(&place) else { return };
     let folder = browser.save_downloads(&place.at(""));
     let viewer = Viewer::start(&["run"], &folder);
-    browser.emulate([1200, 800], 1.0, false, "light");
+    browser.set_size([1200, 800]);
     browser.open(&viewer.url);
     let seq = rest_after(&mut browser, 0);
     assert_eq!(browser.evaluate("location.search"), "", "the token is not left in the address");
@@ -121,11 +121,11 @@ fn render_export(browser: &mut Chromium, place: &Place, num_frames: usize) -> im
     image::open(place.at(&format!("frames/frame-{:05}.png", num_frames - 1))).expect("PNG").to_rgb8()
 }
 
-/// Writes the picture of the documents, of the scene `CLIFT_VIEW_NUMBER` in the list, and one of every layout:
-/// `CLIFT_VIEW_SCENE=runs/tiny CLIFT_VIEW_OUT=shots cargo test --release --workspace viewer_screenshots -- --ignored`.
+/// Writes the picture of the documents, of the scene `CLIFT_VIEW_NUMBER` in the list:
+/// `CLIFT_VIEW_SCENE=runs/tiny CLIFT_VIEW_OUT=shots cargo test --release --workspace viewer_screenshot -- --ignored`.
 #[test]
-#[ignore = "writes pictures"]
-fn viewer_screenshots() {
+#[ignore = "writes a picture"]
+fn viewer_screenshot() {
     let [scene, out] = ["CLIFT_VIEW_SCENE", "CLIFT_VIEW_OUT"].map(|name| std::env::var(name).expect(name));
     let place = Place::new();
     let out = std::path::absolute(out).expect("a path");
@@ -133,49 +133,8 @@ fn viewer_screenshots() {
     let scene = std::path::absolute(scene).expect("a path");
     let mut browser = browser(&place).expect("Chromium");
     let viewer = Viewer::start(&[&scene.display().to_string()], &repository(""));
-    let shots: [(&str, [u32; 2], bool, &str); 4] = [
-        ("light", [1360, 860], false, "light"),
-        ("dark", [1360, 860], false, "dark"),
-        ("phone", [390, 844], true, "light"),
-        ("phone-dark", [390, 844], true, "dark"),
-    ];
-    for (name, size, is_phone, scheme) in shots {
-        browser.emulate(size, if is_phone { 2.0 } else { 1.0 }, is_phone, scheme);
-        browser.open(&viewer.url);
-        let mut seq = rest_after(&mut browser, 0);
-        let [x, y] = size.map(|side| f64::from(side) * 0.35);
-        for (dx, dy) in [(-40.0, 10.0), (90.0, -20.0)] {
-            browser.evaluate("document.getElementById('add-keyframe').click()");
-            if !is_phone {
-                browser.drag([x, y], [x + dx, y + dy]);
-                seq = rest_after(&mut browser, seq);
-            }
-        }
-        if !is_phone {
-            browser.evaluate("document.getElementById('add-keyframe').click()");
-        }
-        browser.evaluate("const render = document.getElementById('render'); render.value = render.max - 2; render.dispatchEvent(new Event('input'))");
-        browser.evaluate("document.querySelector('#overlay [data-value=selected]').click()");
-        rest_after(&mut browser, seq);
-        browser.screenshot(&out.join(format!("{name}.png")));
-        if name == "dark" {
-            browser.evaluate("document.querySelector('#overlay [data-value=clusters]').click()");
-            browser.evaluate("document.getElementById('compare').click()");
-            browser.wait_for(
-                "document.getElementById('compare-section').hidden || !document.getElementById('wipe').hidden",
-            );
-            std::thread::sleep(Duration::from_millis(500));
-            browser.screenshot(&out.join("compare.png"));
-            browser.evaluate("document.getElementById('help').showModal()");
-            browser.screenshot(&out.join("help.png"));
-        }
-        if is_phone {
-            browser.evaluate("document.getElementById('panel').scrollTo(0, 520)");
-            browser.screenshot(&out.join(format!("{name}-panel.png")));
-        }
-    }
     // The picture of the documents: true image beside rendering, from most of all tokens.
-    browser.emulate([1240, 904], 1.0, false, "light");
+    browser.set_size([1240, 904]);
     browser.open(&viewer.url);
     rest_after(&mut browser, 0);
     let number = std::env::var("CLIFT_VIEW_NUMBER").unwrap_or_else(|_| "0".into());

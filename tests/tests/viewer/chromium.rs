@@ -154,12 +154,11 @@ impl Chromium {
         folder.to_path_buf()
     }
 
-    /// Sets the size of the page in CSS pixels, and light or dark.
-    pub fn emulate(&mut self, [width, height]: [u32; 2], scale: f64, is_phone: bool, scheme: &str) {
-        let metrics = json!({"width": width, "height": height, "deviceScaleFactor": scale, "mobile": is_phone});
+    /// Sets the size of the page in CSS pixels, and its light colours.
+    pub fn set_size(&mut self, [width, height]: [u32; 2]) {
+        let metrics = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
         self.call("Emulation.setDeviceMetricsOverride", metrics);
-        self.call("Emulation.setTouchEmulationEnabled", json!({"enabled": is_phone}));
-        let features = json!({"features": [{"name": "prefers-color-scheme", "value": scheme}]});
+        let features = json!({"features": [{"name": "prefers-color-scheme", "value": "light"}]});
         self.call("Emulation.setEmulatedMedia", features);
     }
 }

@@ -38,28 +38,21 @@ fn only_the_url_with_its_token_opens_the_page() {
     let cookie = head.lines().find_map(|line| line.strip_prefix("set-cookie: ")).expect("a cookie");
     let cookie = format!("{own}Cookie: {}\r\n", cookie.split(';').next().expect("a value"));
     assert!(http(&viewer, "/viewer.js", &cookie).starts_with("HTTP/1.1 200"));
+    // `server/access.rs` tests which tokens, hosts and origins are refused; here that requests and sockets are checked.
     for (path, headers, status) in [
-        ("/", own.clone(), 403),
-        ("/viewer.js", own.clone(), 403),
-        ("/?token=00000000000000000000000000000000", own.clone(), 403),
-        ("/", cookie.replace(host.as_str(), "evil.example"), 403),
-        ("/../../etc/passwd", cookie.clone(), 404),
-        ("/config.toml", cookie.clone(), 404),
-        ("/viewer.js", format!("{cookie}Origin: http://evil.example\r\n"), 403),
+        ("/", &own, 403),
+        ("/viewer.js", &own, 403),
+        ("/", &cookie.replace(host.as_str(), "evil.example"), 403),
+        ("/viewer.js", &format!("{cookie}Origin: http://evil.example\r\n"), 403),
+        ("/../../etc/passwd", &cookie, 404),
     ] {
-        let answer = http(&viewer, path, &headers);
+        let answer = http(&viewer, path, headers);
         assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{path} {headers}: {answer}");
     }
     let origin = format!("http://{host}");
     assert!(viewer.socket(host, &origin, token).is_some());
-    for (host, origin, token) in [
-        (host.as_str(), origin.as_str(), "0123"),
-        (host, "http://evil.example", token),
-        (host, "null", token),
-        ("evil.example", "http://evil.example", token),
-    ] {
-        assert!(viewer.socket(host, origin, token).is_none(), "{host} {origin} {token}");
-    }
+    assert!(viewer.socket(host, &origin, "0123").is_none());
+    assert!(viewer.socket(host, "http://evil.example", token).is_none());
 }
 
 #[test]

@@ -41,19 +41,3 @@ impl FromStr for Selection {
         parse_value("selection", name)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn selections_are_names() {
-        for name in ["paper", "global", "scaled", "random"] {
-            let selection: Selection = serde_json::from_str(&format!("\"{name}\"")).unwrap();
-            assert_eq!((selection.to_string(), name.parse::<Selection>().unwrap()), (name.to_owned(), selection));
-            assert_eq!(serde_json::to_value(selection).unwrap(), name);
-        }
-        let message = "all".parse::<Selection>().unwrap_err().to_string();
-        assert!(message.contains("paper, global, scaled, random"), "{message}");
-    }
-}

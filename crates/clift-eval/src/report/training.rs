@@ -77,14 +77,4 @@ mod tests {
         assert_eq!((short.len(), short[0], short[199]), (200, (3.0, 3.0), (998.0, 998.0)));
         assert_eq!(averaged(&[(1, f64::NAN), (2, 5.0), (3, f64::INFINITY)]), [(2.0, 5.0)]);
     }
-
-    #[test]
-    fn both_lines_are_in_the_plot() {
-        let curve = TrainingCurve { stage: "stage1", training: vec![(1, 9.0), (2, 10.0)], validation: vec![(2, 12.0)] };
-        let html = section(&[curve]).into_string();
-        for part in ["stage1", "validation, step 2: 12.00 dB", "training, step 1: 9.00 dB", "<polyline"] {
-            assert!(html.contains(part), "{part}: {html}");
-        }
-        assert_eq!(section(&[]).into_string(), "");
-    }
 }

@@ -397,19 +397,4 @@ mod tests {
         assert_eq!(of(lvsm).frame_quartiles_s, Some([0.04; 2]), "another network of as many tokens");
         assert_eq!([f16, int8, random, all].map(|key| of(key).pareto_time), [true, false, false, true]);
     }
-
-    #[test]
-    fn both_pareto_fronts_are_marked() {
-        let mut views = EvalResults::default();
-        // (stored, dB, ms, bytes): the second is slower and worse than the first but smaller than the third.
-        for (stored, psnr, ms, bytes) in [(8, 20.0, 1.0, 900), (4, 19.0, 2.0, 400), (16, 22.0, 3.0, 1600)] {
-            let key = EvalKey { num_storage_tokens: stored, ..CLIFT };
-            let measured = ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr, None) };
-            views.add("a", 0, key, measured);
-            views.add_scene_bytes(key, bytes);
-        }
-        let points = Summary::new(&views).points;
-        let marks: Vec<_> = points.iter().map(|p| (p.key.num_storage_tokens, p.pareto_time, p.pareto_bytes)).collect();
-        assert_eq!(marks, [(4, false, true), (8, true, true), (16, true, true)]);
-    }
 }

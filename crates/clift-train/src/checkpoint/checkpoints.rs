@@ -361,17 +361,6 @@ mod tests {
     }
 
     #[test]
-    fn a_resume_removes_what_killed_processes_left() {
-        let place = tempfile::tempdir().unwrap();
-        let (mut train_state, checkpoints, step) = saved(place.path());
-        let removed = step.with_file_name("step-000000030.tmp");
-        std::fs::create_dir(&removed).unwrap();
-        std::fs::write(removed.join(MODEL), b"half").unwrap();
-        assert!(checkpoints.resume(&mut train_state).unwrap().is_some());
-        assert!(step.exists() && !removed.exists());
-    }
-
-    #[test]
     fn last_best_and_regular_checkpoints_are_kept() {
         let steps = [10, 20, 30, 40, 50, 60];
         let removed = |keep, keep_every, keep_best, best: u64| {

@@ -359,7 +359,10 @@ mod tests {
                 "`loss.perceptual_weight` = 0.5: VGG-19 needs images of at least 16 x 16, not 8 x 256: write 0",
             ),
             (|c| c.stage1.half_resolution = 600.0, "`stage1.half_resolution` = 600: write 0 to 1"),
-            (|c| c.data.views.min_context = 0, "`data.views.min_context` = 0: use 2 or more"),
+            (
+                |c| (c.checkpoint.every, c.checkpoint.keep_every) = (2, 3),
+                "`checkpoint.keep_every` = 3: write 0 or a multiple of checkpoint.every, which is 2",
+            ),
             (
                 |c| c.stage1.optimizer.weight_decay = f64::NAN,
                 "`stage1.optimizer.weight_decay` = NaN: write 0 or a positive number",

@@ -188,12 +188,4 @@ mod tests {
             ["unknown section [cluster]\n  --> tiny.toml:6:2", "unknown key `step` in [stage2]\n  --> --set:1:8"]
         );
     }
-
-    #[test]
-    fn lists_of_another_length_are_refused() {
-        for text in ["stage1.keep_tokens=[0]", "stage1.keep_tokens=[0, 1, 2]"] {
-            let message = message(FILE, &["device=wgpu", text]);
-            assert!(message.starts_with("wrong value of `stage1.keep_tokens`\n  --> --set:1:20\n"), "{message}");
-        }
-    }
 }

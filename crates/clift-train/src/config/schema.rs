@@ -42,27 +42,3 @@ pub(crate) fn nearest<'a>(word: &str, candidates: impl Iterator<Item = &'a str>)
 pub(crate) fn join(section: &str, key: &str) -> String {
     if section.is_empty() { key.to_owned() } else { format!("{section}.{key}") }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::config::Config;
-
-    #[test]
-    fn sections_of_a_type_have_its_keys() {
-        let sections = sections::<Config>();
-        assert_eq!(sections[""][..2], ["run_dir", "seed"]);
-        assert_eq!(sections["clusters.kmeans"], ["max_iterations", "tolerance"]);
-        assert!(sections.contains_key("data.synthetic") && sections.contains_key("stage1.optimizer"));
-        assert!(!sections.contains_key("seed") && !sections.contains_key("eval.index"));
-    }
-
-    #[test]
-    fn nearest_key_is_within_the_edit_distance() {
-        let near = |word| nearest(word, ["num_heads", "dim", "steps"].into_iter());
-        assert_eq!(near("num_head"), Some("num_heads"));
-        assert_eq!(near("step"), Some("steps"));
-        assert_eq!(near("din"), Some("dim"));
-        assert_eq!(near("learning_rate"), None);
-    }
-}

@@ -125,7 +125,7 @@ pub(crate) fn describe(
 ) -> String {
     let ModelConfig { variant, dim, num_heads, num_encoder_blocks, num_renderer_blocks, .. } = model;
     let mut text = format!(
-        "the checkpoint is no {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
+        "the checkpoint is not a {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
          {num_renderer_blocks} layers); no files were written"
     );
     let [missing, unknown, strays] = [Kind::Missing, Kind::Unknown, Kind::Stray].map(|kind| {

@@ -111,17 +111,6 @@ mod tests {
         }
     }
 
-    #[test]
-    fn second_evaluations_of_a_folder_are_refused_at_once() {
-        let place = tempfile::tempdir().unwrap();
-        let first = open(place.path(), false).unwrap();
-        let message = open(place.path(), true).unwrap_err().to_string();
-        let holder = format!("is in use by process {}; wait until it exits or set another --out", std::process::id());
-        assert!(message.contains(&holder), "{message}");
-        drop(first);
-        open(place.path(), true).unwrap();
-    }
-
     #[cfg(unix)]
     #[test]
     fn links_into_a_run_are_resolved() {

@@ -95,27 +95,3 @@ impl RunLock {
         Ok(Self { file })
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn second_lock_is_refused_with_the_process_id() {
-        let folder = tempfile::tempdir().unwrap();
-        let sink = &mut |_: &Event| {};
-        let lock = RunLock::take(folder.path(), LockedFolder::Run, sink).unwrap();
-        let error = RunLock::take(folder.path(), LockedFolder::Run, sink).unwrap_err();
-        let TrainError::Locked { what, holder, path, .. } = error else { panic!("{error}") };
-        assert_eq!(what, "run directory");
-        assert_eq!(holder, format!("process {}", std::process::id()));
-        assert_eq!(path, folder.path());
-        drop(lock);
-        assert_eq!(std::fs::read(folder.path().join("lock")).unwrap(), b"");
-        // The id of a dead process has no effect.
-        std::fs::write(folder.path().join("lock"), "4194303").unwrap();
-        let _lock = RunLock::take(folder.path(), LockedFolder::Run, sink).unwrap();
-        let id = std::fs::read_to_string(folder.path().join("lock")).unwrap();
-        assert_eq!(id, std::process::id().to_string());
-    }
-}

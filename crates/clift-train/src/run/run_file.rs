@@ -226,33 +226,3 @@ fn free_name(folder: &Path) -> PathBuf {
         number += 1;
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<StepExtension>, TrainError> {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join("config.toml"), old).unwrap();
-        compare_settings(folder.path(), &RunFile::new(None), config, None, extend)
-    }
-
-    fn old() -> Config {
-        Config { run_dir: "run".into(), ..Config::default() }
-    }
-
-    #[test]
-    fn step_counts_grow_only_with_extend() {
-        let text = toml::to_string_pretty(&old()).unwrap();
-        let mut longer = old();
-        longer.stage2.steps += 10;
-        let message = differ(&text, &longer, false).unwrap_err().to_string();
-        assert!(message.contains("  stage2.steps: 50000 -> 50010\n") && message.contains("--extend"), "{message}");
-        let expected = StepExtension { stage: Stage::Stage2, from: 50_000, to: 50_010 };
-        assert_eq!(differ(&text, &longer, true).unwrap(), [expected]);
-        longer.stage1.steps -= 1;
-        let message = differ(&text, &longer, true).unwrap_err().to_string();
-        assert!(message.contains("settings:\n  stage1.steps: 90000 -> 89999\nresume"), "{message}");
-        assert!(!message.contains("--extend"), "{message}");
-    }
-}

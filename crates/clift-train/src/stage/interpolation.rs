@@ -61,18 +61,6 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_of_the_way_is_a_quarter_of_every_difference() {
-        let [start, trained] = [1, 2].map(model);
-        let between = interpolate(&start, trained.clone(), 0.25);
-        let [start, trained, between] = [&start, &trained, &between].map(values);
-        assert!(start != trained);
-        for ((start, trained), between) in start.iter().zip(&trained).zip(&between) {
-            let expected = start + 0.25 * (trained - start);
-            assert!((between - expected).abs() <= 1e-6, "{between} instead of {expected}");
-        }
-    }
-
-    #[test]
     fn equal_weights_stay_equal_bit_for_bit() {
         struct Negative;
         impl ModuleMapper for Negative {

@@ -133,20 +133,6 @@ mod tests {
     }
 
     #[test]
-    fn configs_need_no_data() {
-        let config = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/re10k.toml").into();
-        let json = JsonArg { path: None, force: false };
-        let args = FlopsArgs {
-            config: Some(config),
-            convention: FlopConvention::Macs,
-            render: Vec::new(),
-            set: Vec::new(),
-            json,
-        };
-        assert_eq!(sizes(&args).unwrap().model, ModelConfig::default());
-    }
-
-    #[test]
     fn macs_have_every_part_and_flops_are_twice_as_many() {
         let (macs, flops) = (counts(FlopConvention::Macs), counts(FlopConvention::Flops));
         let parts: Vec<&str> = macs.rows.iter().map(|row| row.work).collect();

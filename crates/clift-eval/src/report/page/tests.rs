@@ -92,6 +92,14 @@ fn page(report: &Report) -> String {
 fn pages_have_all_sections_and_no_external_resources() {
     let html = page(&report());
     for part in [
+        "<h2>Quality and cost</h2>",
+        "<h2>All points</h2>",
+        "<h2>Scene by scene</h2>",
+        "<h2>Images of scenes</h2>",
+        "<h2>Training</h2>",
+        "<h2>Skipped scenes</h2>",
+        "<h2>Command and machine</h2>",
+        "<h2>Config</h2>",
         "Quality against stored tokens",
         "Quality against the size of a scene",
         "Quality against rendered tokens",
@@ -101,7 +109,7 @@ fn pages_have_all_sections_and_no_external_resources() {
         "4 clusters",
         "2 of 8 tokens selected for the target",
         "2 of 3 scenes were evaluated",
-        "Scene by scene",
+        "training, step 1: 9.00 dB",
         "validation, step 1: 8.00 dB",
         "error, 8 tokens",
         "clift eval ",
@@ -137,8 +145,10 @@ fn pages_without_selections_or_points_explain_the_gap() {
     assert!(html.contains("--render 1/4,1/2") && !html.contains("Quality against rendered tokens"));
     plain.summary.points.clear();
     plain.figures.clear();
+    plain.training.clear();
     plain.skipped = SkipReport::default();
     let html = page(&plain);
+    assert!(!html.contains("<h2>Training</h2>"));
     assert!(html.contains("No measured points") && html.contains("eval.num_sheets"), "{html}");
 }
 

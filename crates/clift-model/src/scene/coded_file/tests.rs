@@ -125,7 +125,7 @@ fn hostile_files_with_valid_checksums_are_refused() {
         (hash.as_str(), "0123456789abcdef", "the scene was coded with the codec 0123456789abcdef"),
         ("\"codec\"", "\"coder\"", "no `codec` in the header"),
         ("\"scene\":{", "\"scenf\":{", "no tensor `scene`"),
-        ("\"version\":\"5\"", "\"version\":\"6\"", "version \"6\", expected \"1\" to \"5\""),
+        ("\"version\":\"5\"", "\"version\":\"6\"", "scene file of version 6, this clift reads versions 2 and 5"),
     ] {
         let message = folder.refusal_of(&checked(with_header(&bytes, &[(from, to)])));
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
