@@ -52,7 +52,9 @@ impl EvalResults {
     pub(crate) fn merge(&mut self, other: Self) {
         for (key, scenes) in other.views {
             for (scene, frames) in scenes {
-                frames.into_iter().for_each(|(frame, view)| self.add(&scene, frame, key, view));
+                for (frame, view) in frames {
+                    self.add(&scene, frame, key, view);
+                }
             }
         }
         for (key, cost) in other.costs {
