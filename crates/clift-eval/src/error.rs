@@ -78,12 +78,6 @@ pub enum EvalError {
     /// A scene without context views has no baseline.
     #[error("baselines need at least one context view, got none")]
     NoContext,
-    /// A view was added twice under one key, and would count twice in every mean.
-    #[error("duplicate view: {view}")]
-    DuplicateView {
-        /// Scene, frame, method and token counts.
-        view: String,
-    },
     /// No model renders a method.
     #[error("no weights for the method `{method}`")]
     NoModel {

@@ -4,55 +4,15 @@ use std::path::Path;
 
 use clift_core::replace_file;
 use clift_model::TokenCoding;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SSIM, ViewMetrics, view_mean};
 
-const VIEW_COLUMNS: [&str; 11] = [
-    "scene",
-    "target_frame",
-    "method",
-    "num_storage_tokens",
-    "num_render_tokens",
-    "psnr",
-    "ssim",
-    "lpips_vgg",
-    "render_s",
-    "select_s",
-    "tokens",
-];
-
-const SCENE_COLUMNS: [&str; 9] =
-    ["scene", "method", "num_storage_tokens", "num_render_tokens", "tokens", "num_views", "psnr", "ssim", "lpips_vgg"];
-
-/// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
-pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
-    let rows = results.views().flat_map(|(key, scenes)| {
-        let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
-        views.map(move |(scene, (frame, view))| {
-            [
-                scene.clone(),
-                frame.to_string(),
-                key.method.name().into(),
-                key.num_storage_tokens.to_string(),
-                key.num_render_tokens.to_string(),
-                view.psnr.to_string(),
-                text(view.ssim),
-                text(view.lpips_vgg),
-                text(view.render_s),
-                text(view.select_s),
-                key.format_name(),
-            ]
-        })
-    });
-    write(path, VIEW_COLUMNS, rows).map_err(EvalError::io("writing the metrics of the views", path))
-}
-
 /// A row of `views.csv`.
-#[derive(Deserialize)]
+#[derive(Serialize, Deserialize)]
 struct ViewRow {
     scene: String,
     target_frame: usize,
@@ -67,10 +27,50 @@ struct ViewRow {
     tokens: Option<TokenCoding>,
 }
 
-/// Reads `views.csv`.
+/// A row of `scenes.csv`.
+#[derive(Serialize)]
+struct SceneRow<'a> {
+    scene: &'a str,
+    method: Method,
+    num_storage_tokens: usize,
+    num_render_tokens: usize,
+    tokens: Option<TokenCoding>,
+    num_views: usize,
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    lpips_vgg: Option<f64>,
+}
+
+/// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
+pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
+    let rows = results.views().flat_map(|(key, scenes)| {
+        let EvalKey { method, num_storage_tokens, num_render_tokens, tokens } = key;
+        let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
+        views.map(move |(scene, (&target_frame, view))| {
+            let ViewMetrics { psnr, ssim, lpips_vgg, render_s, select_s } = *view;
+            let scene = scene.clone();
+            ViewRow {
+                scene,
+                target_frame,
+                method,
+                num_storage_tokens,
+                num_render_tokens,
+                psnr,
+                ssim,
+                lpips_vgg,
+                render_s,
+                select_s,
+                tokens,
+            }
+        })
+    });
+    write(path, rows).map_err(EvalError::io("writing the metrics of the views", path))
+}
+
+/// Reads `views.csv`. Of two rows of one view under one key the first counts.
 ///
 /// # Errors
-/// [`EvalError::NotComparable`] for a file of another format, [`EvalError::DuplicateView`] for two rows of one view.
+/// [`EvalError::NotComparable`] for a file of another format.
 pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
     let bad = |error: csv::Error| EvalError::NotComparable { reason: error.to_string(), path: path.into() };
     let mut results = EvalResults::default();
@@ -80,7 +80,7 @@ pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
         let ViewRow { psnr, ssim, lpips_vgg, render_s, select_s, .. } = row;
         let key = EvalKey { method, num_storage_tokens, num_render_tokens, tokens };
         let view = ViewMetrics { psnr, ssim, lpips_vgg, render_s, select_s };
-        results.add(&row.scene, row.target_frame, key, view)?;
+        results.add(&row.scene, row.target_frame, key, view);
     }
     Ok(results)
 }
@@ -88,36 +88,25 @@ pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
 /// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene.
 pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
-        scenes.iter().map(move |(scene, views)| {
-            [
-                scene.clone(),
-                key.method.name().into(),
-                key.num_storage_tokens.to_string(),
-                key.num_render_tokens.to_string(),
-                key.format_name(),
-                views.len().to_string(),
-                text(view_mean(views, PSNR)),
-                text(view_mean(views, SSIM)),
-                text(view_mean(views, LPIPS)),
-            ]
+        scenes.iter().map(move |(scene, views)| SceneRow {
+            scene,
+            method: key.method,
+            num_storage_tokens: key.num_storage_tokens,
+            num_render_tokens: key.num_render_tokens,
+            tokens: key.tokens,
+            num_views: views.len(),
+            psnr: view_mean(views, PSNR),
+            ssim: view_mean(views, SSIM),
+            lpips_vgg: view_mean(views, LPIPS),
         })
     });
-    write(path, SCENE_COLUMNS, rows).map_err(EvalError::io("writing the means of the scenes", path))
+    write(path, rows).map_err(EvalError::io("writing the means of the scenes", path))
 }
 
-fn text(value: Option<f64>) -> String {
-    value.map(|value| value.to_string()).unwrap_or_default()
-}
-
-fn write<const N: usize>(
-    path: &Path,
-    columns: [&str; N],
-    rows: impl Iterator<Item = [String; N]>,
-) -> std::io::Result<()> {
+fn write(path: &Path, rows: impl Iterator<Item = impl Serialize>) -> std::io::Result<()> {
     let mut csv = csv::Writer::from_writer(Vec::new());
-    csv.write_record(columns)?;
     for row in rows {
-        csv.write_record(&row)?;
+        csv.serialize(row)?;
     }
     replace_file(path, &csv.into_inner().map_err(csv::IntoInnerError::into_error)?)
 }
@@ -139,15 +128,15 @@ mod tests {
         ];
         let views = "\
 scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens
-attic,2,clift,64,32,23,0.5,0.75,0.25,,f16
-attic,9,clift,64,32,20,0.5,0.25,0.25,,f16
+attic,2,clift,64,32,23.0,0.5,0.75,0.25,,f16
+attic,9,clift,64,32,20.0,0.5,0.25,0.25,,f16
 \"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.25,,f16
 attic,9,nearest_view,0,0,18.5,,,,,
 ";
         let scenes = "\
 scene,method,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg
 attic,clift,64,32,f16,2,21.5,0.5,0.5
-\"room, \"\"big\"\"\",clift,64,32,f16,1,100,0.5,
+\"room, \"\"big\"\"\",clift,64,32,f16,1,100.0,0.5,
 attic,nearest_view,0,0,,1,18.5,,
 ";
         let folder = tempfile::tempdir().unwrap();
@@ -155,7 +144,7 @@ attic,nearest_view,0,0,,1,18.5,,
         for order in [[0, 1, 2, 3], [3, 2, 1, 0]] {
             let mut results = EvalResults::default();
             for (scene, frame, key, view) in order.map(|i| rows[i]) {
-                results.add(scene, frame, key, view).unwrap();
+                results.add(scene, frame, key, view);
             }
             write_views(&results, &path).unwrap();
             assert_eq!(std::fs::read_to_string(&path).unwrap(), views);

@@ -1,6 +1,5 @@
 //! The metrics of every view of an evaluation.
 
-use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
@@ -8,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use crate::config::method::Method;
 use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
-use crate::error::EvalError;
 use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics};
 
 /// A metric that was not measured.
@@ -44,39 +42,19 @@ pub struct EvalResults {
 }
 
 impl EvalResults {
-    /// Adds one view of a scene.
-    ///
-    /// # Errors
-    /// [`EvalError::DuplicateView`] when the results already hold the view under this key.
-    pub fn add(&mut self, scene: &str, frame: usize, key: EvalKey, view: ViewMetrics) -> Result<(), EvalError> {
+    /// Adds one view of a scene. Of two results for a view under one key the first counts.
+    pub fn add(&mut self, scene: &str, frame: usize, key: EvalKey, view: ViewMetrics) {
         let scenes = self.views.entry(key).or_default();
-        match scenes.entry(scene.to_owned()).or_default().entry(frame) {
-            Entry::Vacant(entry) => {
-                entry.insert(view);
-                Ok(())
-            }
-            Entry::Occupied(_) => {
-                let EvalKey { method, num_storage_tokens: stored, num_render_tokens: rendered, .. } = key;
-                let method = method.name();
-                let view = format!("{method} of {scene}, frame {frame}, {stored} stored, {rendered} rendered");
-                Err(EvalError::DuplicateView { view })
-            }
-        }
-    }
-
-    /// Returns whether a view has been added.
-    pub fn contains(&self, scene: &str, frame: usize, key: EvalKey) -> bool {
-        self.of(key).and_then(|scenes| scenes.get(scene)).is_some_and(|frames| frames.contains_key(&frame))
+        scenes.entry(scene.to_owned()).or_default().entry(frame).or_insert(view);
     }
 
     /// Adds the views that another process has measured of other scenes.
-    ///
-    /// # Errors
-    /// As [`EvalResults::add`].
-    pub(crate) fn merge(&mut self, other: Self) -> Result<(), EvalError> {
+    pub(crate) fn merge(&mut self, other: Self) {
         for (key, scenes) in other.views {
             for (scene, frames) in scenes {
-                frames.into_iter().try_for_each(|(frame, view)| self.add(&scene, frame, key, view))?;
+                for (frame, view) in frames {
+                    self.add(&scene, frame, key, view);
+                }
             }
         }
         for (key, cost) in other.costs {
@@ -94,7 +72,6 @@ impl EvalResults {
         self.not_measured.extend(other.not_measured);
         self.selection = self.selection.or(other.selection);
         self.context_targets.extend(other.context_targets);
-        Ok(())
     }
 
     /// Iterates over the views of every key, in the order of keys.
@@ -135,23 +112,21 @@ mod tests {
     fn parts_of_several_processes_are_merged() {
         let part = |scene: &str, bytes| {
             let mut part = EvalResults::default();
-            part.add(scene, 1, CLIFT, ViewMetrics::quality(f64::INFINITY, None)).unwrap();
+            part.add(scene, 1, CLIFT, ViewMetrics::quality(f64::INFINITY, None));
             part.add_scene_bytes(CLIFT, bytes);
             part
         };
         let mut whole = part("attic", 10);
-        whole.merge(part("cellar", 20)).unwrap();
+        whole.merge(part("cellar", 20));
         assert_eq!(whole.of(CLIFT).unwrap().len(), 2);
         assert_eq!(whole.costs[&CLIFT].scene_bytes, Some(15));
-        assert!(whole.merge(part("attic", 10)).is_err(), "a scene twice");
     }
 
     #[test]
-    fn duplicate_views_are_refused() {
+    fn a_view_counts_once() {
         let mut views = EvalResults::default();
-        views.add("attic", 9, CLIFT, ViewMetrics::quality(20.0, None)).unwrap();
-        let message = views.add("attic", 9, CLIFT, ViewMetrics::quality(30.0, None)).unwrap_err().to_string();
-        assert_eq!(message, "duplicate view: clift of attic, frame 9, 64 stored, 32 rendered");
+        views.add("attic", 9, CLIFT, ViewMetrics::quality(20.0, None));
+        views.add("attic", 9, CLIFT, ViewMetrics::quality(30.0, None));
         assert_eq!(views.of(CLIFT).unwrap()["attic"][&9].psnr, 20.0);
     }
 }

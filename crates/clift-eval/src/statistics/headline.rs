@@ -83,12 +83,12 @@ mod tests {
                     let tokens = Some(tokens);
                     let key = EvalKey { method, num_storage_tokens: count, num_render_tokens: count, tokens };
                     let psnr = 10.0 + better + count as f64 / 8.0 - loss;
-                    results.add("a", 0, key, ViewMetrics::quality(psnr, None)).unwrap();
+                    results.add("a", 0, key, ViewMetrics::quality(psnr, None));
                 }
             }
         }
         let nearest = EvalKey::baseline(Method::NearestView);
-        results.add("a", 0, nearest, ViewMetrics::quality(12.25, None)).unwrap();
+        results.add("a", 0, nearest, ViewMetrics::quality(12.25, None));
         results.skipped.insert("b".into());
         Summary::new(&results)
     }

@@ -61,7 +61,7 @@ mod tests {
             ("hall", 1, key(Method::Random, 16, 16), 40.0),
             ("hall", 1, EvalKey::baseline(Method::NearestView), f64::INFINITY),
         ] {
-            results.add(scene, frame, key, ViewMetrics::quality(psnr, None)).unwrap();
+            results.add(scene, frame, key, ViewMetrics::quality(psnr, None));
         }
         let scores = SceneScores::new(&results);
         assert_eq!(scores.key, Some(key(Method::Clift, 8, 8)));

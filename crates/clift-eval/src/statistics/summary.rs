@@ -42,6 +42,13 @@ pub struct Baselines {
     pub mean_image: Quality,
 }
 
+impl Baselines {
+    /// Returns both with their methods.
+    pub(crate) const fn list(self) -> [(Method, Quality); 2] {
+        [(Method::NearestView, self.nearest_view), (Method::MeanImage, self.mean_image)]
+    }
+}
+
 /// Means of one key; `null` where nothing was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SummaryPoint {
@@ -284,7 +291,7 @@ mod tests {
     fn results(views: &[(&str, usize, f64)]) -> EvalResults {
         let mut results = EvalResults::default();
         for &(scene, frame, psnr) in views {
-            results.add(scene, frame, CLIFT, ViewMetrics::quality(psnr, Some(psnr / 100.0))).unwrap();
+            results.add(scene, frame, CLIFT, ViewMetrics::quality(psnr, Some(psnr / 100.0)));
         }
         results
     }
@@ -312,7 +319,7 @@ mod tests {
     fn the_file_has_the_documented_names() {
         let mut views = results(&[("a", 0, 20.0)]);
         let copy = ViewMetrics::quality(f64::INFINITY, Some(1.0));
-        views.add("a", 0, EvalKey::baseline(Method::NearestView), copy).unwrap();
+        views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
         let cost =
@@ -355,7 +362,7 @@ mod tests {
             let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
             let measured =
                 ViewMetrics { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..ViewMetrics::quality(20.0, None) };
-            views.add("a", frame, CLIFT, measured).unwrap();
+            views.add("a", frame, CLIFT, measured);
         }
         let point = Summary::new(&views).points.remove(0);
         let near = |got: Option<f64>, expected: f64| (got.unwrap() - expected).abs() < 1e-12;
@@ -378,9 +385,9 @@ mod tests {
             let ms = 10.0 + frame as f64;
             for (key, ms, psnr) in [(f16, ms, 22.0), (int8, ms - 0.5, 21.0), (random, ms - 0.9, 20.0), (all, 2.0, 19.0)]
             {
-                views.add("a", frame, key, timed(ms, psnr)).unwrap();
+                views.add("a", frame, key, timed(ms, psnr));
             }
-            views.add("a", frame, lvsm, timed(40.0, 18.0)).unwrap();
+            views.add("a", frame, lvsm, timed(40.0, 18.0));
         }
         let points = Summary::new(&views).points;
         let of = |key| points.iter().find(|point| point.key == key).unwrap();

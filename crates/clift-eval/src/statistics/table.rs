@@ -37,8 +37,7 @@ impl fmt::Display for Summary {
             writeln!(f, "warning: {warning}")?;
         }
         writeln!(f)?;
-        let baselines = [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)];
-        let baselines = baselines.map(|(method, quality)| baseline_cells(method, quality, *num_views));
+        let baselines = baselines.list().map(|(method, quality)| baseline_cells(method, quality, *num_views));
         writeln!(f, "{}", table(HEADER, baselines.into_iter().chain(points.iter().map(point_cells))))?;
         if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
             writeln!(
@@ -128,13 +127,13 @@ mod tests {
                 select_s: Some(0.01),
                 ..ViewMetrics::quality(psnr, Some(psnr / 100.0))
             };
-            views.add(scene, 0, key, measured).unwrap();
+            views.add(scene, 0, key, measured);
         }
         let name = MethodName::new("DepthSplat").unwrap();
         let other = EvalKey::baseline(Method::External(name));
-        views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
+        views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) });
         views.record_missing_image(other.method, "b/000000.png".into());
-        views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5)));
         let cost =
             Cost { gflops: Some(45.23), scene_values: Some(49_152), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(key, cost);

@@ -29,11 +29,6 @@ impl EvalKey {
         Self { method, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
     }
 
-    /// Returns the name of the tokens' storage; empty without tokens.
-    pub fn format_name(self) -> String {
-        self.tokens.map_or_else(String::new, |tokens| tokens.to_string())
-    }
-
     /// Returns whether views are rendered from all stored tokens.
     pub const fn is_whole(self) -> bool {
         self.num_render_tokens == self.num_storage_tokens

@@ -46,7 +46,7 @@ pub fn evaluate_scene(
     let renderer = TargetRenderer { clip, scorer: &scorer, cameras: Cameras::upload(&[&clip.target], device)?, sweep };
     let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
     for rendering in &results.renderings {
-        record(clip, rendering, metrics)?;
+        record(clip, rendering, metrics);
     }
     let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
     metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
@@ -58,14 +58,14 @@ pub fn evaluate_scene(
     let num_timed =
         jobs.first().and_then(|job| metrics.of(job.key)).map_or(0, |scenes| scenes.values().map(BTreeMap::len).sum());
     for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
-        record(clip, &rendering, metrics)?;
+        record(clip, &rendering, metrics);
         if !job.kept_views.is_empty() {
             results.renderings.push(rendering);
         }
     }
     for external in &sweep.external_methods {
         let scored = external.score(clip, &scorer, &kept_views, metrics)?;
-        record(clip, &scored, metrics)?;
+        record(clip, &scored, metrics);
         results.renderings.push(scored);
     }
     Ok((!kept_views.is_empty()).then_some(results))
@@ -178,14 +178,10 @@ fn add_whole_jobs<'a>(
 }
 
 /// Adds the metrics of a scene under one key. A frame that is a target twice counts once.
-fn record(clip: &Clip, rendering: &ScoredViews, metrics: &mut EvalResults) -> Result<(), EvalError> {
+fn record(clip: &Clip, rendering: &ScoredViews, metrics: &mut EvalResults) {
     for (&view, &measured) in &rendering.metrics {
-        let frame = clip.target.frame_index[view];
-        if !metrics.contains(&clip.key, frame, rendering.key) {
-            metrics.add(&clip.key, frame, rendering.key, measured)?;
-        }
+        metrics.add(&clip.key, clip.target.frame_index[view], rendering.key, measured);
     }
-    Ok(())
 }
 
 /// Renderings of all target views under one key.

@@ -16,7 +16,7 @@ fn summary() -> Summary {
     let mut results = EvalResults::default();
     for (scene, shift) in [("a", 0.0), ("b", 1.0)] {
         let nearest = ViewMetrics::quality(15.0 + shift, Some(0.4));
-        results.add(scene, 3, EvalKey::baseline(Method::NearestView), nearest).unwrap();
+        results.add(scene, 3, EvalKey::baseline(Method::NearestView), nearest);
         for (method, stored, rendered, psnr, ms) in [
             (Method::Clift, 4, 4, 16.0, 2.0),
             (Method::Clift, 8, 8, 18.0, 3.0),
@@ -25,7 +25,7 @@ fn summary() -> Summary {
         ] {
             let key = key(method, stored, rendered);
             let metrics = ViewMetrics::quality(psnr + shift, Some(psnr / 40.0));
-            results.add(scene, 3, key, ViewMetrics { render_s: Some(ms * 1e-3), ..metrics }).unwrap();
+            results.add(scene, 3, key, ViewMetrics { render_s: Some(ms * 1e-3), ..metrics });
             if method == Method::Clift {
                 results.add_scene_bytes(key, 1000 * stored as u64);
             }
@@ -188,7 +188,7 @@ fn external_methods_are_escaped_everywhere_and_missing_images_noted() {
     let mut other = report();
     let mut results = EvalResults::default();
     let key = EvalKey::baseline(Method::External(name));
-    results.add("a", 3, key, ViewMetrics::quality(17.0, Some(0.5))).unwrap();
+    results.add("a", 3, key, ViewMetrics::quality(17.0, Some(0.5)));
     results.add_scene_bytes(key, 5_000);
     results.record_missing_image(Method::External(name), "b/000003.png".into());
     results.note_not_measured("lpips_vgg", "no <weights>".into());

@@ -1,6 +1,7 @@
 //! Parsers of argument values.
 
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clift_data::Split;
 use clift_eval::MethodFilter;
@@ -53,7 +54,7 @@ pub(crate) fn parse_training_step(text: &str) -> Result<RunStep, String> {
 }
 
 pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
-    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number of at least 1".into())
+    parse_number(text, |count| *count > 0, "write a number of at least 1")
 }
 
 /// Parses the path of a file to write, before the work whose results it takes.
@@ -92,20 +93,17 @@ pub(crate) fn parse_views(text: &str) -> Result<[usize; 2], String> {
 }
 
 pub(crate) fn parse_budget_ms(text: &str) -> Result<f64, String> {
-    let budget = text.parse().ok().filter(|budget: &f64| *budget > 0.0 && budget.is_finite());
-    budget.ok_or_else(|| "write milliseconds per frame, more than 0".into())
+    parse_number(text, |ms: &f64| *ms > 0.0 && ms.is_finite(), "write milliseconds per frame, more than 0")
 }
 
 /// Parses a loss of PSNR in dB.
 pub(crate) fn parse_loss(text: &str) -> Result<f64, String> {
-    let loss = text.parse().ok().filter(|loss: &f64| (1e-3..=10.0).contains(loss));
-    loss.ok_or_else(|| "write a loss in dB, 0.001 to 10".into())
+    parse_number(text, |loss| (1e-3..=10.0).contains(loss), "write a loss in dB, 0.001 to 10")
 }
 
 /// Parses a size in kB.
 pub(crate) fn parse_kb(text: &str) -> Result<f64, String> {
-    let kb = text.parse().ok().filter(|kb: &f64| *kb > 0.0 && *kb <= 1e9);
-    kb.ok_or_else(|| "write kilobytes, more than 0".into())
+    parse_number(text, |kb| *kb > 0.0 && *kb <= 1e9, "write kilobytes, more than 0")
 }
 
 /// Parses a replacement in parameter names, as `attn.qn=attn.q_norm`.
@@ -114,6 +112,10 @@ pub(crate) fn parse_rename(text: &str) -> Result<(String, String), String> {
         Some((from, to)) if !from.is_empty() => Ok((from.into(), to.into())),
         _ => Err("write FROM=TO".into()),
     }
+}
+
+fn parse_number<T: FromStr>(text: &str, is_valid: impl Fn(&T) -> bool, fix: &str) -> Result<T, String> {
+    text.parse().ok().filter(is_valid).ok_or_else(|| fix.into())
 }
 
 fn parse_pair(text: &str, separator: &str) -> Option<[usize; 2]> {
