@@ -61,7 +61,7 @@ pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{BatchTokens, StageBatch};
 pub use step::device_batch::{DeviceBatch, render_loss};
-pub use step::loss::{ImageLoss, Loss, LossParts, mse};
+pub use step::loss::{Loss, LossParts, LossTerm, Rendering, mse};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::{StageOptimizer, clip_global_norm, global_norm};
 pub use step::schedule::learning_rate;

@@ -1,7 +1,7 @@
 //! Whole updates by the code of training: loss, gradient, AdamW.
 
 use clift_model::{Clift, Clusters, RenderTokens, upload_images};
-use clift_train::{BatchTokens, Loss, OptimizerConfig, Stage, StageBatch, TrainState, freeze};
+use clift_train::{BatchTokens, Loss, OptimizerConfig, Rendering, Stage, StageBatch, TrainState, freeze};
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
@@ -30,7 +30,7 @@ pub fn batch(place: &Place, stage: Stage) -> StageBatch {
         Stage::Stage2 => BatchTokens::Clusters(clusters()),
         _ => BatchTokens::Subsets(subsets(5)),
     };
-    StageBatch { clips: place.clips(), tokens, skipped: Vec::new() }
+    StageBatch { step: 0, clips: place.clips(), tokens, skipped: Vec::new() }
 }
 
 pub fn step(learner: TrainState, batch: &StageBatch, parts: usize) -> (TrainState, clift_train::Update) {
@@ -64,7 +64,9 @@ fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
     };
     let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
     let pictures = upload_images(&targets, &place.device).expect("equal sizes");
-    let loss = Loss::default().of(model.renderer.forward(tokens, &place.targets()), pictures).total;
+    let values = tokens.values().clone();
+    let images = model.renderer.forward(tokens, &place.targets());
+    let loss = Loss::default().of(&Rendering { images, tokens: values, step: 0 }, pictures).total;
     gradients(model, &loss.backward())
 }
 

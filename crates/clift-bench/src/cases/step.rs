@@ -103,7 +103,7 @@ fn gradients(
     batch: &StageBatch,
     device_batch: DeviceBatch,
 ) -> Result<(f64, GradientsParams), TrainError> {
-    let loss = render_loss(model, &device_batch, &batch.tokens, &Loss::default())?.total;
+    let loss = render_loss(model, &device_batch, &batch.tokens, &Loss::default(), batch.step)?.total;
     let grads = GradientsParams::from_grads(loss.clone().mul_scalar(loss_factor()).backward(), model);
     Ok((values(loss.inner())[0], grads))
 }

@@ -92,12 +92,11 @@ impl<'a, E> Pass<'a, E> {
         self.model.renderer.blocks().to_image(state.x.expect("the values after the last block"), self.targets)
     }
 
-    /// Applies all blocks and returns the images.
+    /// Applies all blocks and returns the values after the last one.
     ///
     /// # Errors
     /// Those of the token step.
-    pub fn render(&self) -> Result<Tensor<5>, E> {
-        let last = (0..self.num_blocks()).try_fold(PassState::default(), |state, index| self.block(index, state))?;
-        Ok(self.to_image(last))
+    pub fn forward(&self) -> Result<PassState, E> {
+        (0..self.num_blocks()).try_fold(PassState::default(), |state, index| self.block(index, state))
     }
 }

@@ -113,10 +113,8 @@ impl Config {
 
     /// Checks weights and sizes of the loss. The VGG weights are checked when training starts.
     fn validate_loss(&self) -> Result<(), BadConfig> {
+        self.loss.validate()?;
         let weight = self.loss.perceptual_weight;
-        check_config(weight >= 0.0 && weight.is_finite(), "loss.perceptual_weight", weight, || {
-            "write 0 or a positive number".into()
-        })?;
         let (width, height) = (self.data.width, self.data.height);
         let (is_large, least) = (width.min(height) >= PERCEPTUAL_MIN_SIZE_PX, PERCEPTUAL_MIN_SIZE_PX);
         check_config(weight == 0.0 || is_large, "loss.perceptual_weight", weight, || {

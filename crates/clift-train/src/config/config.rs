@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_core::derive_seed;
+use clift_core::{BadConfig, check_config, derive_seed};
 use clift_data::DataConfig;
 use clift_eval::{EvalConfig, PERCEPTUAL_COMMAND, Sweep};
 use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCount};
@@ -121,6 +121,17 @@ pub struct LossConfig {
 }
 
 impl LossConfig {
+    /// Checks the weights of the terms.
+    ///
+    /// # Errors
+    /// [`BadConfig`] for a weight that is negative or not finite.
+    pub fn validate(&self) -> Result<(), BadConfig> {
+        let weight = self.perceptual_weight;
+        check_config(weight >= 0.0 && weight.is_finite(), "loss.perceptual_weight", weight, || {
+            "write 0 or a positive number".into()
+        })
+    }
+
     /// Returns the path of the VGG weights if there is a perceptual term.
     ///
     /// # Errors

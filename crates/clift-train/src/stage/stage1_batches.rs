@@ -69,6 +69,6 @@ impl Stage1Batches {
             });
             BatchTokens::Subsets(subsets.collect())
         };
-        Ok(StageBatch { clips, tokens, skipped })
+        Ok(StageBatch { step, clips, tokens, skipped })
     }
 }

@@ -63,7 +63,7 @@ impl Stage2Batches {
             clips.push(clip);
             clusters.push(scene);
         }
-        Ok(StageBatch { clips, tokens: BatchTokens::Clusters(clusters), skipped })
+        Ok(StageBatch { step, clips, tokens: BatchTokens::Clusters(clusters), skipped })
     }
 
     /// Samples a group in proportion to its size, so that all entries are equally likely.

@@ -11,6 +11,8 @@ use crate::error::TrainError;
 /// slots.
 #[derive(Clone, Debug)]
 pub struct StageBatch {
+    /// Update of the stage, counted from 0.
+    pub step: u64,
     /// One clip per slot.
     pub clips: Vec<Clip>,
     /// Tokens of the renderer, per slot.

@@ -7,7 +7,7 @@ use clift_model::{Cameras, Clift, Pass, TokenStep, Views, upload_images};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
-use crate::step::loss::{Loss, LossParts};
+use crate::step::loss::{Loss, LossParts, Rendering};
 
 /// The views of a batch on a device.
 pub struct DeviceBatch {
@@ -54,7 +54,7 @@ impl DeviceBatch {
     }
 }
 
-/// Renders the target views from selected tokens and returns the loss, with autodiff.
+/// Renders the target views from selected tokens and returns the loss of an update, with autodiff.
 ///
 /// # Errors
 /// Those of clusters that do not fit the tokens.
@@ -63,7 +63,9 @@ pub fn render_loss(
     device_batch: &DeviceBatch,
     batch_tokens: &BatchTokens,
     loss: &Loss,
+    step: u64,
 ) -> Result<LossParts, TrainError> {
-    let images = device_batch.pass(model, &batch_tokens.step()).render()?;
-    Ok(loss.of(images, device_batch.target_images.clone()))
+    let token_step = batch_tokens.step();
+    let pass = device_batch.pass(model, &token_step);
+    Ok(loss.of(&Rendering::of(&pass, pass.forward()?, step), device_batch.target_images.clone()))
 }

@@ -5,17 +5,37 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
 use clift_eval::Perceptual;
+use clift_model::{Pass, PassState};
 
 use crate::config::config::LossConfig;
 use crate::error::TrainError;
 
+/// Rendered target views of a batch, and their origin.
+#[derive(Clone, Debug)]
+pub struct Rendering {
+    /// RGB in `(0, 1)`, `[batch, views, height, width, 3]`.
+    pub images: Tensor<5>,
+    /// Tokens that the images are rendered from, `[sets, num_tokens, dim]`: one set per scene, or per target view.
+    pub tokens: Tensor<3>,
+    /// Update of the stage, counted from 0.
+    pub step: u64,
+}
+
+impl Rendering {
+    /// Decodes the values after the last block of a pass.
+    pub(crate) fn of<E>(pass: &Pass<'_, E>, last: PassState, step: u64) -> Self {
+        let tokens = last.tokens.as_ref().expect("the renderer's tokens").values().clone();
+        Self { images: pass.to_image(last), tokens, step }
+    }
+}
+
 /// A term of the training loss. `examples/custom_loss.rs` trains with a new one.
-pub trait ImageLoss: fmt::Debug + Send + Sync {
+pub trait LossTerm: fmt::Debug + Send + Sync {
     /// Computes the term, `[1]`, with autodiff.
     ///
     /// # Shapes
-    /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
-    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1>;
+    /// - `target`: `[batch, views, height, width, 3]` in `[0, 1]`
+    fn loss(&self, rendering: &Rendering, target: &Tensor<5>) -> Tensor<1>;
 
     /// Describes the term for the log of a run.
     fn describe(&self) -> Option<String> {
@@ -23,9 +43,9 @@ pub trait ImageLoss: fmt::Debug + Send + Sync {
     }
 }
 
-impl ImageLoss for Perceptual {
-    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1> {
-        self.forward(rendering.clone(), target.clone())
+impl LossTerm for Perceptual {
+    fn loss(&self, rendering: &Rendering, target: &Tensor<5>) -> Tensor<1> {
+        self.forward(rendering.images.clone(), target.clone())
     }
 
     fn describe(&self) -> Option<String> {
@@ -36,7 +56,7 @@ impl ImageLoss for Perceptual {
 /// The minimized loss, the same in both stages: mean squared error plus weighted terms. The default has no further term.
 #[derive(Clone, Debug, Default)]
 pub struct Loss {
-    terms: Vec<(f64, Arc<dyn ImageLoss>)>,
+    terms: Vec<(f64, Arc<dyn LossTerm>)>,
 }
 
 /// The loss of a batch, with autodiff.
@@ -61,7 +81,7 @@ impl Loss {
 
     /// Adds `weight` times a term.
     #[must_use]
-    pub fn with_term(mut self, weight: f64, term: impl ImageLoss + 'static) -> Self {
+    pub fn with_term(mut self, weight: f64, term: impl LossTerm + 'static) -> Self {
         self.terms.push((weight, Arc::new(term)));
         self
     }
@@ -71,13 +91,13 @@ impl Loss {
         self.terms.iter().filter_map(|(_, term)| term.describe())
     }
 
-    /// Computes the loss of renderings.
+    /// Computes the loss of a rendering.
     ///
     /// # Shapes
-    /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
-    pub fn of(&self, rendering: Tensor<5>, target: Tensor<5>) -> LossParts {
-        let mse = mse(rendering.clone(), target.clone());
-        let weighted = self.terms.iter().map(|(weight, term)| term.loss(&rendering, &target).mul_scalar(*weight));
+    /// - `target`: `[batch, views, height, width, 3]` in `[0, 1]`
+    pub fn of(&self, rendering: &Rendering, target: Tensor<5>) -> LossParts {
+        let mse = mse(rendering.images.clone(), target.clone());
+        let weighted = self.terms.iter().map(|(weight, term)| term.loss(rendering, &target).mul_scalar(*weight));
         LossParts { total: weighted.fold(mse.clone(), |total, term| total + term), mse }
     }
 }

@@ -97,7 +97,7 @@ pub fn seeded_batch(
         }
     };
     let clips = (0..batch_size).map(|slot| seeded_clip(shape, seed, slot)).collect();
-    Ok(StageBatch { clips, tokens, skipped: Vec::new() })
+    Ok(StageBatch { step: 0, clips, tokens, skipped: Vec::new() })
 }
 
 /// Samples uniform values in `[-1, 1)`.

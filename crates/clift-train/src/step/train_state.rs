@@ -110,12 +110,12 @@ impl TrainState {
                         &model,
                         &device_batch,
                         &tokens,
-                        &loss,
+                        (&loss, batch.step),
                         share * factor,
                         &mut accumulator,
                     )?
                 } else {
-                    let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss)?;
+                    let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss, batch.step)?;
                     let grads = total.clone().mul_scalar(share * factor).backward();
                     accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
                     LossParts { total: total.inner(), mse: mse.inner() }

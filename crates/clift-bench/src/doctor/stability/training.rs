@@ -43,7 +43,7 @@ fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -
     for _ in 0..STEPS {
         let device_batch = DeviceBatch::upload(&batch.clips, &device)?;
         let device_batch = if in_f64 { device_batch.in_f64(&device) } else { device_batch };
-        let loss = render_loss(&model, &device_batch, &batch.tokens, &Loss::default())?.total;
+        let loss = render_loss(&model, &device_batch, &batch.tokens, &Loss::default(), batch.step)?.total;
         losses.push(values(loss.clone().inner())[0]);
         let grads = GradientsParams::from_grads(loss.backward(), &model);
         let norm = global_norm(&model, &grads);
