@@ -14,7 +14,11 @@ const CRATES: [Crate; 9] = [
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights codec scene"),
+    (
+        "clift-model",
+        "clift-core clift-kernels",
+        "error names device ops views tokens network cost weights metrics codec scene",
+    ),
     (
         "clift-data",
         "clift-core",
@@ -24,7 +28,7 @@ const CRATES: [Crate; 9] = [
     (
         "clift-eval",
         "clift-core clift-kernels clift-model clift-data",
-        "error system config metrics statistics encode sweep figures report evaluator codec",
+        "error system config statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",

@@ -23,18 +23,6 @@ pub enum EvalError {
         /// The problem.
         reason: String,
     },
-    /// The weight file of a metric or loss is not usable.
-    #[error("bad weights for {what}: {reason}; make the file with `{command}`: {path}", path = path.display())]
-    BadWeights {
-        /// The metric or loss.
-        what: &'static str,
-        /// The problem.
-        reason: String,
-        /// Command that makes the file.
-        command: &'static str,
-        /// The file.
-        path: PathBuf,
-    },
     /// The name of an external method is not allowed.
     #[error("bad method name `{name}`: {reason}")]
     BadMethodName {

@@ -27,6 +27,19 @@
 //! assert_eq!(image.dims(), [1, 1, 16, 16, 3]);
 //! # Ok::<(), clift_model::ModelError>(())
 //! ```
+//!
+//! The metrics work on plain slices, `[height, width, 3]`:
+//!
+//! ```
+//! use clift_model::{psnr, ssim};
+//!
+//! let (height, width) = (16, 16);
+//! let target = vec![0.5; height * width * 3];
+//! let rendering: Vec<f32> = target.iter().map(|value| value + 0.1).collect();
+//! assert!((psnr(&rendering, &target)? - 20.0).abs() < 1e-3);
+//! assert!(ssim(&rendering, &target, height, width)? > 0.9);
+//! # Ok::<(), clift_model::ModelError>(())
+//! ```
 #![cfg_attr(
     feature = "ndarray",
     expect(
@@ -39,6 +52,7 @@ mod codec;
 mod cost;
 mod device;
 mod error;
+mod metrics;
 mod names;
 mod network;
 mod ops;
@@ -99,6 +113,11 @@ pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, up
 pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
 pub use network::layers::Part;
+// Metrics of images, and the perceptual loss
+pub use metrics::image_metrics::{SSIM_MIN_SIZE_PX, check_images, psnr, psnr_of_mse, ssim};
+pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
+pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
+pub use metrics::vgg::{Pooling, VggShape, VggSizes};
 // Weight files and trained models
 pub use weights::file::{first_not_f32, load_part, save_part, save_part_f16, save_weights, sorted_header};
 pub use weights::hash::weights_hash;

@@ -3,8 +3,7 @@
 //! `cargo run --release -p clift-train --example custom_loss`
 
 use burn::tensor::Tensor;
-use clift_eval::psnr_of_mse;
-use clift_model::{DeviceName, ModelConfig};
+use clift_model::{DeviceName, ModelConfig, psnr_of_mse};
 use clift_train::{ClipShape, ImageLoss, Loss, OptimizerConfig, TrainError, TrainState, seeded_batch, seeded_model};
 
 /// Mean absolute difference of the horizontal gradients of rendering and target.

@@ -78,10 +78,10 @@ fn data_exit_code(error: &DataError) -> u8 {
 }
 
 fn eval_exit_code(error: &EvalError) -> u8 {
-    use EvalError::{BadMethodName, BadWeights, Interrupted, NoPredictions, NotComparable};
+    use EvalError::{BadMethodName, Interrupted, NoPredictions, NotComparable};
     match error {
         Interrupted { .. } => interrupt::exit_code(),
-        BadMethodName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
+        BadMethodName { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
         EvalError::Data(error) => data_exit_code(error),
         EvalError::Model(error) => model_exit_code(error),
         _ => FAILED,
@@ -100,11 +100,13 @@ fn view_exit_code(error: &ViewError) -> u8 {
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {
     use clift_model::ModelError::{
-        BadConfig, BadTokenCount, NoCodec, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
+        BadConfig, BadTokenCount, BadWeights, NoCodec, NoConfig, NoDevice, NoModel, NotDivisible, NotImported,
+        OtherRenderer,
     };
     match error {
         BadConfig { .. }
         | BadTokenCount { .. }
+        | BadWeights { .. }
         | NoCodec { .. }
         | NoConfig { .. }
         | NoDevice { .. }

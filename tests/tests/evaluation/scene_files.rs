@@ -3,9 +3,9 @@
 use std::process::Command;
 
 use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
-use clift_eval::{Canvas, psnr, ssim};
+use clift_eval::Canvas;
 use clift_model::{
-    Precision, Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer,
+    Precision, Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer, psnr, ssim,
 };
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};

@@ -10,14 +10,13 @@ use clift_core::{derive_seed, item_rng, mean};
 use clift_data::{Clip, ClipReader, EvaluationItem};
 use clift_model::{
     Cameras, Histograms, KMeans, LevelCounts, Moments, NeighbourProducts, Places, RateTable, TokenCodec, TokenCount,
-    TokenKind, Tokens, TrainedModel, Transform, Views,
+    TokenKind, Tokens, TrainedModel, Transform, Views, psnr_of_mse,
 };
 use rand::RngExt;
 
 use crate::encode::host_values;
 use crate::error::EvalError;
 use crate::evaluator::progress::EvalProgress;
-use crate::metrics::image_metrics::psnr_of_mse;
 use crate::sweep::compressed_tokens::with_values;
 
 /// Most scenes that transform and distributions are fitted on; each is read three times, with one of the counts.

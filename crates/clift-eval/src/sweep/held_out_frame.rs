@@ -2,10 +2,9 @@
 
 use clift_core::Camera;
 use clift_data::{ClipReader, ViewIndices};
-use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel};
+use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel, psnr};
 
 use crate::error::EvalError;
-use crate::metrics::image_metrics::psnr;
 use crate::sweep::baselines::{nearest_image, view_image};
 
 /// Largest number of frames that are tried: images may be unreadable.

@@ -1,10 +1,9 @@
 //! Settings of a sweep over methods and token counts.
 
-use clift_model::{KMeans, ModelConfig, TokenCoding, TokenCount};
+use clift_model::{KMeans, Lpips, ModelConfig, TokenCoding, TokenCount};
 
 use crate::config::method::Method;
 use crate::config::token_selection::Selection;
-use crate::metrics::lpips::Lpips;
 use crate::sweep::predictions::ExternalMethod;
 
 /// Settings of a sweep.

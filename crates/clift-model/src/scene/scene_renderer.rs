@@ -184,7 +184,7 @@ impl SceneRenderer {
         let draw = |cameras: &Cameras| self.renderer.render_cached(cache, cameras);
         let images = interleaved(self.trained_height, self.renderer.patch_size(), &cameras, draw);
         let images = images.into_data().convert::<f32>();
-        let pixels = images.try_to_vec::<f32>().map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
+        let pixels = images.try_to_vec::<f32>().map_err(ModelError::device)?;
         let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
         if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
             return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });

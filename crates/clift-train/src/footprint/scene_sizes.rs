@@ -1,7 +1,7 @@
 //! Sizes of the steps of a run: all possible ones, the largest.
 
-use clift_eval::{LPIPS_MIN_SIZE_PX, Method, Sweep};
-use clift_model::SceneSizes;
+use clift_eval::{Method, Sweep};
+use clift_model::{LPIPS_MIN_SIZE_PX, SceneSizes};
 
 use crate::config::config::Config;
 use crate::error::TrainError;

@@ -2,7 +2,7 @@
 //!
 //! Images are row-major `[height, width, 3]` slices with values in [0, 1].
 
-use crate::error::EvalError;
+use crate::error::ModelError;
 
 /// Smallest height and width that hold one SSIM window.
 pub const SSIM_MIN_SIZE_PX: usize = 2 * SSIM_RADIUS + 1;
@@ -19,9 +19,9 @@ const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 /// The mean squared error is over all values. Identical images give `+inf`, which counts as 100 dB in means.
 ///
 /// # Errors
-/// [`EvalError::BadImage`], also where clamping would hide a NaN or an infinity.
-pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
-    check(pred, target, target.len())?;
+/// [`ModelError::BadImage`], also where clamping would hide a NaN or an infinity.
+pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, ModelError> {
+    check_images(pred, target, target.len())?;
     let squared_error: f64 = pred
         .iter()
         .zip(target)
@@ -42,9 +42,9 @@ pub fn psnr_of_mse(mse: f64) -> f64 {
 /// images are not clamped.
 ///
 /// # Errors
-/// [`EvalError::BadImage`], also below 11 x 11 pixels.
-pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, EvalError> {
-    check(pred, target, height * width * 3)?;
+/// [`ModelError::BadImage`], also below 11 x 11 pixels.
+pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, ModelError> {
+    check_images(pred, target, height * width * 3)?;
     check_size("SSIM", SSIM_MIN_SIZE_PX, height, width)?;
     // Single-threaded (13 ms for 256 x 256): callers have many images to distribute over cores.
     let per_channel = [0, 1, 2].map(|channel| {
@@ -99,36 +99,40 @@ fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64>
     blurred
 }
 
-/// Refuses images of the wrong size, NaN and infinity.
-pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(), EvalError> {
+/// Refuses images of another size than `expected` values, NaN and infinity.
+///
+/// # Errors
+/// [`ModelError::BadImage`].
+pub fn check_images(pred: &[f32], target: &[f32], expected: usize) -> Result<(), ModelError> {
     for (image, name) in [(target, "target"), (pred, "prediction")] {
         if image.len() != expected || image.is_empty() {
-            return Err(EvalError::size_mismatch(expected, image.len()));
+            let reason = format!("image sizes differ: expected {expected} values, got {}", image.len());
+            return Err(ModelError::BadImage { reason });
         }
         if let Some(index) = image.iter().position(|value| !value.is_finite()) {
             let reason = format!("the {name} is not finite: value {} at index {index}", image[index]);
-            return Err(EvalError::BadImage { reason });
+            return Err(ModelError::BadImage { reason });
         }
     }
     Ok(())
 }
 
-pub(crate) fn check_size(metric: &str, min: usize, height: usize, width: usize) -> Result<(), EvalError> {
+pub fn check_size(metric: &str, min: usize, height: usize, width: usize) -> Result<(), ModelError> {
     if height.min(width) >= min {
         return Ok(());
     }
     let reason = format!("{metric} needs at least {min} x {min} pixels, got {width} x {height}");
-    Err(EvalError::BadImage { reason })
+    Err(ModelError::BadImage { reason })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Reference;
+    use crate::testing::Fixture;
 
     #[test]
     fn psnr_and_ssim_equal_torch_and_scikit_image() {
-        let fixture = Reference::open("metrics");
+        let fixture = Fixture::open("metrics");
         let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
         let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
         let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));

@@ -6,7 +6,7 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
-use crate::error::EvalError;
+use crate::error::ModelError;
 use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, Vgg, VggShape};
 
@@ -39,12 +39,12 @@ impl Perceptual {
     /// Reads the weights, which are constants of the loss, to a device without autodiff.
     ///
     /// # Errors
-    /// [`EvalError::BadWeights`] with the command that makes the file.
-    pub fn load(path: &Path, device: &Device) -> Result<Self, EvalError> {
+    /// [`ModelError::BadWeights`] with the command that makes the file.
+    pub fn load(path: &Path, device: &Device) -> Result<Self, ModelError> {
         Self::with_shape(path, VggShape::VGG19, (device, DType::F32))
     }
 
-    fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
+    fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, ModelError> {
         let mut file = NetworkFile::read(path, WANTED)?;
         let vgg = Vgg::take(&mut file, shape, options)?.no_grad();
         Ok(Self { vgg, mean: mean_colour(options), sha256: file.finish()? })
@@ -92,14 +92,14 @@ fn mean_colour(options: (&Device, DType)) -> Tensor<4> {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::DeviceName;
-
     use super::*;
-    use crate::testing::{NARROW, Reference, reference_path};
+    use crate::device::name::DeviceName;
+    use crate::metrics::vgg::tests::NARROW;
+    use crate::testing::Fixture;
 
     fn narrow(options: (&Device, DType)) -> Perceptual {
         let shape = VggShape { widths: NARROW, ..VggShape::VGG19 };
-        Perceptual::with_shape(&reference_path("perceptual_weights"), shape, options).unwrap()
+        Perceptual::with_shape(&Fixture::path("perceptual_weights"), shape, options).unwrap()
     }
 
     fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
@@ -115,8 +115,8 @@ mod tests {
 
     /// Checks loss and gradient. Rounding can flip the sign of a difference near zero, and change an entry of the
     /// gradient. In f32 its tolerance is therefore relative to the largest entry.
-    fn check_fixture(loss: &Perceptual, fixture: &Reference, options: (&Device, DType), tolerances: [f64; 2]) {
-        let tensor = |name: &str| fixture.tensor::<5>(name, options.0, options.1);
+    fn check_fixture(loss: &Perceptual, fixture: &Fixture, options: (&Device, DType), tolerances: [f64; 2]) {
+        let tensor = |name: &str| fixture.tensor_f64::<5>(name, options.0).cast(options.1);
         let (loss, grad) = loss_and_grad(loss, tensor("input.rendering"), tensor("input.target"));
         let (expected, expected_grad) = (fixture.f64s("output.loss")[0], fixture.f64s("grad.input.rendering"));
         assert!((loss - expected).abs() <= tolerances[0] * expected, "{loss} is not {expected}");
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn loss_and_gradient_equal_pytorch() {
-        let fixture = Reference::open("perceptual");
+        let fixture = Fixture::open("perceptual");
         for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
             for (dtype, tolerance) in [(DType::F64, 1e-9), (DType::F32, 1e-4)] {
                 let options = (&device, dtype);
@@ -174,7 +174,7 @@ mod tests {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let device = Device::flex();
         let loss = Perceptual::load(&folder.join("vgg19.safetensors"), &device).unwrap();
-        let fixture = Reference::read(&folder.join("perceptual.safetensors"));
+        let fixture = Fixture::read(&folder.join("perceptual.safetensors"));
         check_fixture(&loss, &fixture, (&device, DType::F32), [1e-4, 1e-3]);
     }
 }

@@ -9,7 +9,7 @@ use burn::tensor::module::{avg_pool2d, max_pool2d};
 use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
 use burn::tensor::{DType, Device, Tensor};
 
-use crate::error::EvalError;
+use crate::error::ModelError;
 use crate::metrics::network_file::NetworkFile;
 
 /// Number of stages. Pooling halves the image between stages.
@@ -114,7 +114,7 @@ impl Vgg {
     }
 
     /// Takes the tensors `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias` out of a file.
-    pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
+    pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, ModelError> {
         let mut vgg = Self::random(shape, options.0);
         for (stage, convs) in vgg.stages.iter_mut().enumerate() {
             for (i, conv) in convs.iter_mut().enumerate() {
@@ -162,8 +162,11 @@ fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
 }
 
 #[cfg(test)]
-mod tests {
+pub mod tests {
     use super::*;
+
+    /// Channels of the narrow networks in the fixtures.
+    pub const NARROW: [usize; NUM_STAGES] = [4, 6, 8, 8, 10];
 
     #[test]
     fn vgg16_has_its_published_size() {

@@ -7,7 +7,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest, Sha256};
 
-use crate::error::EvalError;
+use crate::error::ModelError;
 
 /// Largest accepted file; VGG-16 with its heads has 59 MB.
 const MAX_BYTES: u64 = 256 << 20;
@@ -32,7 +32,7 @@ pub struct NetworkFile {
 
 impl NetworkFile {
     /// Refuses a file that cannot be read, has another format, or holds values that are not finite f32.
-    pub fn read(path: &Path, wanted: WeightFileSpec) -> Result<Self, EvalError> {
+    pub fn read(path: &Path, wanted: WeightFileSpec) -> Result<Self, ModelError> {
         let bad = |reason: String| wanted.bad(reason, path);
         let size = std::fs::metadata(path).map_err(|error| bad(error.to_string()))?.len();
         if size > MAX_BYTES {
@@ -67,7 +67,7 @@ impl NetworkFile {
         name: &str,
         shape: [usize; D],
         (device, dtype): (&Device, DType),
-    ) -> Result<Tensor<D>, EvalError> {
+    ) -> Result<Tensor<D>, ModelError> {
         let Some((found, values)) = self.tensors.remove(name) else {
             return Err(self.wanted.bad(format!("{name} is missing"), &self.path));
         };
@@ -78,7 +78,7 @@ impl NetworkFile {
     }
 
     /// Checks that every tensor was taken, and returns the SHA-256 of the file in 64 hexadecimal digits.
-    pub fn finish(self) -> Result<String, EvalError> {
+    pub fn finish(self) -> Result<String, ModelError> {
         match self.tensors.keys().next() {
             None => Ok(self.sha256),
             Some(name) => Err(self.wanted.bad(format!("{name} is not part of the network"), &self.path)),
@@ -87,8 +87,8 @@ impl NetworkFile {
 }
 
 impl WeightFileSpec {
-    fn bad(self, reason: String, path: &Path) -> EvalError {
-        EvalError::BadWeights { what: self.what, reason, command: self.command, path: path.into() }
+    fn bad(self, reason: String, path: &Path) -> ModelError {
+        ModelError::BadWeights { what: self.what, reason, command: self.command, path: path.into() }
     }
 }
 

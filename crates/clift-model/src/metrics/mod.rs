@@ -1,4 +1,4 @@
-//! PSNR, SSIM, LPIPS, perceptual loss.
+//! Metrics of images, and the networks that measure them: PSNR, SSIM, LPIPS, and the perceptual loss.
 //!
 //! - `image_metrics`: PSNR and SSIM
 //! - `vgg`: VGG-16 and VGG-19 features

@@ -6,8 +6,8 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
-use crate::error::EvalError;
-use crate::metrics::image_metrics::{check, check_size};
+use crate::error::ModelError;
+use crate::metrics::image_metrics::{check_images, check_size};
 use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, NUM_STAGES, Vgg, VggShape};
 
@@ -46,19 +46,19 @@ impl Lpips {
     /// Reads the weights.
     ///
     /// # Errors
-    /// [`EvalError::BadWeights`] with the command that makes the file.
-    pub fn load(path: &Path, device: &Device) -> Result<Self, EvalError> {
+    /// [`ModelError::BadWeights`] with the command that makes the file.
+    pub fn load(path: &Path, device: &Device) -> Result<Self, ModelError> {
         Self::with_shape(path, VggShape::VGG16, (device, DType::F32))
     }
 
-    fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
+    fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, ModelError> {
         let mut file = NetworkFile::read(path, WANTED)?;
         let vgg = Vgg::take(&mut file, shape, options)?.no_grad();
         let head = |(stage, channels): (usize, usize)| {
             let head = file.take(&format!("head{}.weight", stage + 1), [channels], options)?;
             Ok(head.reshape([1, channels, 1, 1]))
         };
-        let heads = shape.widths.into_iter().enumerate().map(head).collect::<Result<_, EvalError>>()?;
+        let heads = shape.widths.into_iter().enumerate().map(head).collect::<Result<_, ModelError>>()?;
         Ok(Self { vgg, heads, device: options.0.clone(), sha256: file.finish()? })
     }
 
@@ -70,9 +70,9 @@ impl Lpips {
     /// Computes the features of an image, `[height, width, 3]` in `[0, 1]`; other values are not clamped.
     ///
     /// # Errors
-    /// [`EvalError::BadImage`], also below 16 x 16 pixels.
-    pub fn features(&self, image: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, EvalError> {
-        check(image, image, height * width * 3)?;
+    /// [`ModelError::BadImage`], also below 16 x 16 pixels.
+    pub fn features(&self, image: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, ModelError> {
+        check_images(image, image, height * width * 3)?;
         check_size("LPIPS", LPIPS_MIN_SIZE_PX, height, width)?;
         let pixels = TensorData::new(image.to_vec(), [1, height, width, 3]);
         let dtype = self.heads[0].dtype();
@@ -91,45 +91,46 @@ impl Lpips {
     /// Returns the distance of two images of the same size; 0 for identical images.
     ///
     /// # Errors
-    /// [`EvalError::Tensor`] when the device fails.
-    pub fn distance(&self, a: &LpipsFeatures, b: &LpipsFeatures) -> Result<f64, EvalError> {
+    /// [`ModelError::Device`] when the device fails.
+    pub fn distance(&self, a: &LpipsFeatures, b: &LpipsFeatures) -> Result<f64, ModelError> {
         let stages = (0..NUM_STAGES).map(|stage| {
             let squared = (a.0[stage].clone() - b.0[stage].clone()).square() * self.heads[stage].clone();
             squared.sum_dim(1).mean() // over positions
         });
         let sum = stages.reduce(|sum, mean| sum + mean).expect("NUM_STAGES is 5").into_data().convert::<f64>();
-        Ok(sum.try_to_vec::<f64>().map_err(EvalError::tensor)?[0])
+        Ok(sum.try_to_vec::<f64>().map_err(ModelError::device)?[0])
     }
 
     /// Returns the distance of two images, `[height, width, 3]`.
     ///
     /// # Errors
     /// As [`Lpips::features`].
-    pub fn measure(&self, pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, EvalError> {
+    pub fn measure(&self, pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, ModelError> {
         self.distance(&self.features(pred, height, width)?, &self.features(target, height, width)?)
     }
 }
 
 impl LpipsFeatures {
-    pub(crate) fn num_bytes(&self) -> usize {
+    /// Returns the memory of the features in bytes.
+    pub fn num_bytes(&self) -> usize {
         self.0.iter().map(|stage| stage.dims().iter().product::<usize>() * size_of::<f32>()).sum()
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use clift_model::DeviceName;
-
     use super::*;
+    use crate::device::name::DeviceName;
     use crate::metrics::image_metrics::{psnr, ssim};
-    use crate::testing::{NARROW, Reference, reference_path};
+    use crate::metrics::vgg::tests::NARROW;
+    use crate::testing::Fixture;
 
     fn narrow(device: &Device) -> Lpips {
-        let path = reference_path("lpips_weights");
+        let path = Fixture::path("lpips_weights");
         Lpips::with_shape(&path, VggShape { widths: NARROW, ..VggShape::VGG16 }, (device, DType::F32)).unwrap()
     }
 
-    fn check_fixture(lpips: &Lpips, fixture: &Reference, tolerance: f64) {
+    fn check_fixture(lpips: &Lpips, fixture: &Fixture, tolerance: f64) {
         let mut most = 0.0_f64;
         let pairs = fixture.names("output.psnr.");
         assert!(!pairs.is_empty(), "an empty fixture checks nothing");
@@ -152,7 +153,7 @@ mod tests {
 
     #[test]
     fn narrow_networks_equal_pytorch() {
-        let fixture = Reference::open("lpips");
+        let fixture = Fixture::open("lpips");
         for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
             // Distances are 0.01 to 1; 13 layers in f32 have a relative error of 1e-6.
             check_fixture(&narrow(&device), &fixture, 1e-5);
@@ -165,7 +166,7 @@ mod tests {
     fn the_full_network_equals_the_lpips_package() {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let lpips = Lpips::load(&folder.join("lpips-vgg.safetensors"), &Device::flex()).unwrap();
-        check_fixture(&lpips, &Reference::read(&folder.join("lpips.safetensors")), 1e-5);
+        check_fixture(&lpips, &Fixture::read(&folder.join("lpips.safetensors")), 1e-5);
     }
 
     #[test]
@@ -187,7 +188,7 @@ mod tests {
         assert!(lpips.measure(&[0.5; 7], &[0.5; 16 * 16 * 3], 16, 16).is_err());
         assert!(lpips.measure(&[f32::NAN; 16 * 16 * 3], &[0.5; 16 * 16 * 3], 16, 16).is_err());
         for (file, part) in [("lpips_weights", "conv1_1.weight has shape"), ("perceptual_weights", "clift-vgg19-1")] {
-            let message = Lpips::load(&reference_path(file), &Device::flex()).unwrap_err().to_string();
+            let message = Lpips::load(&Fixture::path(file), &Device::flex()).unwrap_err().to_string();
             assert!(message.contains(part) && message.contains("convert_vgg.py lpips"), "{message}");
         }
     }
