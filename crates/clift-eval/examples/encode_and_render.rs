@@ -11,10 +11,9 @@ use std::error::Error;
 use std::path::Path;
 
 use clift_data::{ClipReader, DataConfig, DatasetRoot, SourceOptions, Split, open_source};
-use clift_eval::{Canvas, EncodeOptions, HeldOutFrame, encode};
-use clift_model::{
-    DeviceName, Grouping, KMeans, ModelPath, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel,
-};
+use clift_eval::Canvas;
+use clift_model::{DeviceName, Grouping, KMeans, ModelPath, SelectionPreset, TokenCount, TrainedModel};
+use clift_scene::{EncodeOptions, HeldOutFrame, SceneRenderer, TokenFormat, encode};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

@@ -63,9 +63,6 @@ pub enum EvalError {
         /// The evaluation.
         path: PathBuf,
     },
-    /// A scene without context views has no baseline.
-    #[error("baselines need at least one context view, got none")]
-    NoContext,
     /// A view was added twice under one key, and would count twice in every mean.
     #[error("duplicate view: {view}")]
     DuplicateView {
@@ -104,6 +101,9 @@ pub enum EvalError {
     /// The model refused its input or its weights.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
+    /// A baseline or a scene file could not be made.
+    #[error(transparent)]
+    Scene(#[from] clift_scene::SceneError),
     /// A tensor could not be read back from its device.
     #[error("reading a tensor from its device failed: {reason}")]
     Tensor {

@@ -1,13 +1,9 @@
-//! Evaluation of compressive light-field tokens: encode images, render views, measure quality and cost, write reports.
+//! Evaluation of compressive light-field tokens: render views, measure quality and cost, write reports.
 //!
-//! [`encode`] compresses captured images to a scene. [`Evaluator`] measures trained models on test scenes with every method
+//! [`Evaluator`] measures trained models on test scenes with every method
 //! and token count, and writes tables, contact sheets and an HTML report.
-//!
-//! The example `encode_and_render` encodes a folder of photos and renders a view.
 
-mod codec;
 mod config;
-mod encode;
 mod error;
 mod evaluator;
 mod figures;
@@ -20,13 +16,6 @@ mod testing;
 
 // Errors of all functions.
 pub use error::EvalError;
-
-// Encode images.
-pub use encode::{EncodeOptions, EncodedScene, encode, spread_contexts};
-
-// The token codec of a model.
-pub use codec::fit::{CodecOptions, FittedCodec, fit_codec};
-pub use codec::step_choice::{expected_step, step_for_bytes, step_for_loss};
 
 // Settings of an evaluation.
 pub use config::eval_config::EvalConfig;
@@ -45,7 +34,6 @@ pub use report::training::TrainingCurve;
 // One scene with every method and token count.
 pub use sweep::eval_models::EvalModels;
 pub use sweep::evaluate_scene::evaluate_scene;
-pub use sweep::held_out_frame::HeldOutFrame;
 pub use sweep::predictions::{ExternalMethod, file_name};
 pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;

@@ -1,7 +1,7 @@
 //! Keys and views for unit tests.
 
 use clift_core::{Camera, ClipViews, Intrinsics, Pose};
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 
 use crate::config::method::Method;
 use crate::statistics::view_metrics::EvalKey;

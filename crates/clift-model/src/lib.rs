@@ -48,7 +48,6 @@
     )
 )]
 
-mod codec;
 mod cost;
 mod device;
 mod error;
@@ -56,7 +55,6 @@ mod metrics;
 mod names;
 mod network;
 mod ops;
-mod scene;
 #[cfg(test)]
 mod testing;
 mod tokens;
@@ -65,13 +63,14 @@ mod weights;
 
 // Errors, and enums by name
 pub use error::ModelError;
-pub use names::parse_value;
+pub use names::{parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
 pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes};
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras
+pub use views::interleave::{interleaved, phases};
 pub use views::patch::{patchify, unpatchify};
 pub use views::patch_grids::PatchGrids;
 pub use views::rays::plucker;
@@ -109,7 +108,7 @@ pub use ops::linear::{gelu_linear, linear, norm_linear};
 // Parameters, multiply-accumulates and memory of a network
 pub use cost::largest_tensor::{kmeans_values, largest_tensors};
 pub use cost::macs::{FlopConvention, Macs};
-pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, update_bytes};
+pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
 pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
 pub use network::layers::Part;
@@ -120,24 +119,10 @@ pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Percep
 pub use metrics::vgg::{Pooling, VggShape, VggSizes};
 // Weight files and trained models
 pub use weights::file::{first_not_f32, load_part, save_part, save_part_f16, save_weights, sorted_header};
-pub use weights::hash::weights_hash;
+pub use weights::hash::{renderer_hash, weights_hash};
 pub use weights::model_path::{ModelPath, check_condenser, check_sizes, refuse_checkpoint};
 pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
-pub use weights::trained_model::TrainedModel;
-// The coder of tokens in scene files
-pub use codec::histogram::{Distributions, Histograms};
-pub use codec::prediction::{NeighbourProducts, Places, Prediction};
-pub use codec::rates::RateTable;
-pub use codec::token_codec::{LevelCounts, TokenCodec};
-pub use codec::transform::{Moments, Transform};
-// Scene files, and rendering from them
-pub use scene::check::MAX_SIDE_PX;
-pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{Scene, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
-pub use scene::token_coding::{CodedLoss, TokenCoding};
-pub use scene::token_format::TokenFormat;
-pub use scene::write::check_output_path;
+pub use weights::trained_model::{TrainedModel, open_renderer};

@@ -5,7 +5,8 @@ use std::path::Path;
 use burn::tensor::Device;
 use clift_core::replace_file;
 use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural};
-use clift_model::{Architecture, LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, ModelError, TokenCoding};
+use clift_model::{Architecture, LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, ModelError};
+use clift_scene::TokenCoding;
 
 use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;

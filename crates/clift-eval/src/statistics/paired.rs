@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use clift_core::{mean, standard_error};
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;

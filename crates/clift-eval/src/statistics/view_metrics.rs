@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;

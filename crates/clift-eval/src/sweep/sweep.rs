@@ -1,6 +1,7 @@
 //! Settings of a sweep over methods and token counts.
 
-use clift_model::{KMeans, Lpips, ModelConfig, TokenCoding, TokenCount};
+use clift_model::{KMeans, Lpips, ModelConfig, TokenCount};
+use clift_scene::TokenCoding;
 
 use crate::config::method::Method;
 use crate::config::token_selection::Selection;

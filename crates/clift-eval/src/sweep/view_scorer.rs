@@ -8,7 +8,7 @@ use clift_model::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures, SSIM_MIN_SIZE_PX, psn
 
 use crate::error::EvalError;
 use crate::statistics::view_metrics::ViewMetrics;
-use crate::sweep::baselines::view_image;
+use clift_scene::view_image;
 
 /// Memory for the LPIPS features of the target views, which every key is compared with: 31 images of 256 x 256. The
 /// features of further targets are computed every time.

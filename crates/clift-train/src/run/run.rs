@@ -12,9 +12,9 @@ use clift_data::{
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, Summary, write_skip_report};
 use clift_model::{
-    Clift, LPIPS_COMMAND, ModelPath, TokenCodec, TrainedModel, check_sizes, load_part, save_part, save_weights,
-    weights_hash,
+    Clift, LPIPS_COMMAND, ModelPath, TrainedModel, check_sizes, load_part, save_part, save_weights, weights_hash,
 };
+use clift_scene::TokenCodec;
 
 use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;

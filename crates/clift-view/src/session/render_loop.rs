@@ -8,7 +8,8 @@ use burn::tensor::Device;
 use clift_core::RgbImage;
 use clift_data::{encode_jpeg, encode_png};
 use clift_eval::Canvas;
-use clift_model::{DeviceName, PatchGrids, SceneRenderer, SelectionPreset, psnr};
+use clift_model::{DeviceName, PatchGrids, SelectionPreset, psnr};
+use clift_scene::SceneRenderer;
 
 use crate::error::ViewError;
 use crate::protocol::reply::{Comparison, Frame, Reply};

@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clift_core::DVec3;
 use clift_data::{ClipReader, SceneSource, Split, plural};
-use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
-use clift_model::{
-    CodedLoss, ModelError, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TokenKind, TrainedModel,
-    check_output_path,
+use clift_model::{ModelError, TokenCount, TokenKind, TrainedModel};
+use clift_scene::{
+    CodedLoss, EncodeOptions, EncodedScene, HeldOutFrame, Scene, TokenCodec, TokenCoding, TokenFormat,
+    check_output_path, encode, expected_step, step_for_bytes, step_for_loss,
 };
 use serde::Serialize;
 

@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use clift_core::{Camera, median};
+use clift_model::ModelError;
 
-use crate::error::ModelError;
 use crate::scene::scene_renderer::SceneRenderer;
 
 /// Timed shares of the storage tokens, in sixteenths, besides all tokens.

@@ -3,20 +3,17 @@
 use std::path::Path;
 
 use clift_core::{Camera, Pose, PoseNormalization};
+use clift_model::{ModelConfig, ModelError, ModelPath, parse_variant};
 use safetensors::{SafeTensorError, SafeTensors};
 
 use crate::codec::token_codec::TokenCodec;
-use crate::error::ModelError;
-use crate::names::parse;
-use crate::network::config::ModelConfig;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
 use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, VERSION, dtype_name};
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
-use crate::weights::model_path::ModelPath;
-use crate::weights::tensors::Tensors;
+use crate::tensors::Tensors;
 
 /// Longest accepted header; headers of version 2 have 2048 bytes.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
@@ -102,7 +99,7 @@ fn from_bytes(
         return Err(refusal(reason, OTHER_VERSION));
     }
     let kind = fields.get("kind")?;
-    let kind = parse(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
+    let kind = parse_variant(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
     let model: ModelConfig =
         serde_json::from_str(fields.get("model")?).map_err(|error| format!("unreadable `model` ({error})"))?;
 

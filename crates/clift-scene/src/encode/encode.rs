@@ -3,11 +3,10 @@
 
 use clift_core::{Pose, PoseNormalization, derive_seed};
 use clift_data::{ClipReader, DataError, ViewIndices, contexts_along_path};
-use clift_model::{
-    Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, TokenCount, TokenKind, Tokens, TrainedModel, Views,
-};
+use clift_model::{Clusters, Grouping, KMeans, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
 
-use crate::error::EvalError;
+use crate::error::SceneError;
+use crate::scene::scene::Scene;
 
 /// Settings of [`encode`].
 #[derive(Clone, Debug, PartialEq)]
@@ -46,7 +45,7 @@ impl EncodedScene {
     ///
     /// # Errors
     /// The errors of the clusters, which stay valid.
-    pub fn sort_tokens(&mut self) -> Result<(), EvalError> {
+    pub fn sort_tokens(&mut self) -> Result<(), SceneError> {
         let (ids, dim) = (&self.scene.token_ids, self.scene.model.dim);
         let mut order: Vec<usize> = (0..ids.len()).collect();
         order.sort_by_key(|&token| ids[token]);
@@ -66,7 +65,7 @@ impl EncodedScene {
 ///
 /// # Errors
 /// Those of the cameras, and [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
-pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, EvalError> {
+pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, SceneError> {
     let (context, _) = contexts(reader, scene, None, num_views)?;
     Ok(context)
 }
@@ -81,7 +80,7 @@ pub fn encode(
     reader: &ClipReader,
     scene: usize,
     options: &EncodeOptions,
-) -> Result<EncodedScene, EvalError> {
+) -> Result<EncodedScene, SceneError> {
     let (key, data) = (reader.source.key(scene), &reader.options);
     let (context, frame) = contexts(reader, scene, options.context.as_deref(), options.num_context)?;
     let views = ViewIndices { context, target: Vec::new() };
@@ -104,7 +103,7 @@ pub fn encode(
         }
         SceneClusters::identity(num_lift_tokens)
     };
-    let cluster_error = clusters.variance_within(&host_values(&lift)?);
+    let cluster_error = clusters.variance_within(&lift.to_host()?);
     let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
     let (kind, tokens) = if !architecture.supports_clusters() {
         (TokenKind::All, lift)
@@ -113,7 +112,7 @@ pub fn encode(
     } else {
         (TokenKind::Kmeans, lift.centroids(&index))
     };
-    let tokens = host_values(&tokens)?;
+    let tokens = tokens.to_host()?;
     let token_ids = clusters.centroid_index().to_vec();
     debug_assert_eq!(tokens.len(), token_ids.len() * dim, "a row per centroid");
     let scene = Scene {
@@ -139,7 +138,7 @@ fn contexts(
     scene: usize,
     requested: Option<&[usize]>,
     num_views: usize,
-) -> Result<(Vec<usize>, PoseNormalization), EvalError> {
+) -> Result<(Vec<usize>, PoseNormalization), SceneError> {
     let (key, data) = (reader.source.key(scene), &reader.options);
     let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
     let frames = context_frames(&poses, requested, num_views)?;
@@ -150,7 +149,7 @@ fn contexts(
 }
 
 /// Checks the requested context frames, or chooses `num_views` frames along the camera path.
-fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, EvalError> {
+fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, SceneError> {
     let num_frames = poses.len();
     let bad = |value: String, fix: String| bad_config("--context", value, fix);
     let Some(requested) = requested else {
@@ -172,12 +171,7 @@ fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize)
     Ok(requested.to_vec())
 }
 
-/// Returns the values of tokens, `[1, S, D]`, on the host.
-pub(crate) fn host_values(tokens: &Tokens) -> Result<Vec<f32>, EvalError> {
-    tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
-}
-
-fn bad_config(key: &'static str, value: String, fix: String) -> EvalError {
+fn bad_config(key: &'static str, value: String, fix: String) -> SceneError {
     ModelError::BadConfig { key, value, fix }.into()
 }
 

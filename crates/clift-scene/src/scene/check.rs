@@ -1,9 +1,9 @@
 //! Rules of a valid scene, checked before a scene is written and after it is read, because files may be hostile.
 
 use clift_core::{Camera, CameraError, check_near};
+use clift_model::TokenKind;
 
 use crate::scene::scene::{HEADER_BYTES, Scene};
-use crate::tokens::kind::TokenKind;
 
 const MAX_VIEWS: usize = 1024;
 /// Longest side of a context view or a rendered image in pixels.

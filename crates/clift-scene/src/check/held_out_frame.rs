@@ -2,10 +2,12 @@
 
 use clift_core::Camera;
 use clift_data::{ClipReader, ViewIndices};
-use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel, psnr};
+use clift_model::{SelectionPreset, TrainedModel, psnr};
 
-use crate::error::EvalError;
-use crate::sweep::baselines::{nearest_image, view_image};
+use crate::check::baselines::{nearest_image, view_image};
+use crate::error::SceneError;
+use crate::scene::scene::Scene;
+use crate::scene::scene_renderer::SceneRenderer;
 
 /// Largest number of frames that are tried: images may be unreadable.
 const MAX_TRIES: usize = 3;
@@ -33,7 +35,7 @@ impl HeldOutFrame {
         reader: &ClipReader,
         index: usize,
         scene: &Scene,
-    ) -> Result<Option<Self>, EvalError> {
+    ) -> Result<Option<Self>, SceneError> {
         let Some(CheckViews { frames, cameras, truth, size, nearest }) = CheckViews::read(reader, index, scene, 1)?
         else {
             return Ok(None);
@@ -58,7 +60,7 @@ pub(crate) struct CheckViews {
 
 impl CheckViews {
     /// Reads up to `count` frames that are no contexts, the first [`candidates`]; `None` if none is readable.
-    pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, EvalError> {
+    pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, SceneError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let frames = candidates(&context, reader.source.cameras(index)?.len());
         for frames in frames.chunks(count).take(MAX_TRIES) {
@@ -70,12 +72,12 @@ impl CheckViews {
     }
 
     /// Reads the contexts.
-    pub fn contexts(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Self, EvalError> {
+    pub fn contexts(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Self, SceneError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         Self::of_frames(reader, index, scene, &context)
     }
 
-    fn of_frames(reader: &ClipReader, index: usize, scene: &Scene, frames: &[usize]) -> Result<Self, EvalError> {
+    fn of_frames(reader: &ClipReader, index: usize, scene: &Scene, frames: &[usize]) -> Result<Self, SceneError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let cameras = reader.source.cameras(index)?;
         let mut clip = reader.read(index, &ViewIndices { context, target: frames.to_vec() })?;
@@ -103,7 +105,7 @@ pub(crate) fn render_scene(
     scene: &Scene,
     views: &[Camera],
     [height, width]: [usize; 2],
-) -> Result<Vec<Vec<f32>>, EvalError> {
+) -> Result<Vec<Vec<f32>>, SceneError> {
     let rules = SelectionPreset::Paper.rules();
     let mut renderer = SceneRenderer::new(scene, model.network.renderer.clone(), rules, &model.device)?;
     let rendered = renderer.render(views, height, width, scene.num_tokens())?;

@@ -6,8 +6,8 @@ use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
 use clift_core::{folder_of, replace_file};
+use clift_model::ModelError;
 
-use crate::error::ModelError;
 use crate::scene::header::write_fields;
 use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;

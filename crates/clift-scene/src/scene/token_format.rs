@@ -1,11 +1,10 @@
 //! Number formats of the tokens in a scene file.
 // S storage tokens, D width
 
+use clift_model::ModelError;
 use half::f16;
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
-
-use crate::error::ModelError;
 
 /// Largest magnitude of an 8-bit value; -128 is not used, so that the range is symmetric.
 const INT8_MAX: f32 = 127.0;

@@ -1,11 +1,13 @@
 //! The step of a scene's coefficients: the largest of a loss, measured on renderings of the scene, or the smallest of a size.
 
 use clift_data::ClipReader;
-use clift_model::{ModelError, Scene, TokenCodec, TrainedModel};
+use clift_model::{ModelError, TrainedModel};
 
-use crate::codec::fit::{loss, view_errors};
-use crate::error::EvalError;
-use crate::sweep::held_out_frame::{CheckViews, render_scene};
+use crate::check::held_out_frame::{CheckViews, render_scene};
+use crate::codec::token_codec::TokenCodec;
+use crate::error::SceneError;
+use crate::fit::fit::{loss, view_errors};
+use crate::scene::scene::Scene;
 
 /// Most frames that a loss is measured on.
 const MAX_FRAMES: usize = 3;
@@ -21,14 +23,14 @@ const SIZE_SEARCH: usize = 32;
 /// contexts where there is no other frame. Returns the step and its loss in dB.
 ///
 /// # Errors
-/// [`EvalError::NoScenes`] if no frame is readable, and the errors of the model.
+/// [`SceneError::NoScenes`] if no frame is readable, and the errors of the model.
 pub fn step_for_loss(
     model: &TrainedModel,
     reader: &ClipReader,
     index: usize,
     (scene, codec): (&Scene, &TokenCodec),
     loss_db: f64,
-) -> Result<(f32, f64), EvalError> {
+) -> Result<(f32, f64), SceneError> {
     let views = CheckViews::read(reader, index, scene, MAX_FRAMES)?;
     let views = match views {
         Some(views) => views,
@@ -36,7 +38,7 @@ pub fn step_for_loss(
     };
     let exact: Vec<f32> = render_scene(model, scene, &views.cameras, views.size)?.concat();
     let errors = view_errors(&exact, &views.truth, views.truth.len() / views.cameras.len());
-    let measured = |step: f32| -> Result<f64, EvalError> {
+    let measured = |step: f32| -> Result<f64, SceneError> {
         let rounded = Scene { tokens: scene.rounded_tokens(codec, step)?, ..scene.clone() };
         let rounded = render_scene(model, &rounded, &views.cameras, views.size)?.concat();
         Ok(loss(&exact, &rounded, &errors))
@@ -58,7 +60,7 @@ pub fn step_for_loss(
 ///
 /// # Errors
 /// [`ModelError::BadConfig`] with the least size if no step is large enough.
-pub fn step_for_bytes(scene: &Scene, codec: &TokenCodec, bytes: u64) -> Result<(f32, Vec<u8>), EvalError> {
+pub fn step_for_bytes(scene: &Scene, codec: &TokenCodec, bytes: u64) -> Result<(f32, Vec<u8>), SceneError> {
     let [mut low, mut high] = codec.rates.step_range();
     let coded = |step: f64| scene.coded_bytes(codec, step as f32);
     let mut best = coded(high)?;
@@ -87,12 +89,12 @@ pub fn step_for_bytes(scene: &Scene, codec: &TokenCodec, bytes: u64) -> Result<(
 ///
 /// # Errors
 /// [`ModelError::NotDivisible`] for sizes that are no patches.
-pub fn expected_step(scene: &Scene, codec: &TokenCodec, loss_db: f64) -> Result<f32, EvalError> {
+pub fn expected_step(scene: &Scene, codec: &TokenCodec, loss_db: f64) -> Result<f32, SceneError> {
     Ok(codec.rates.step_for_loss(share(scene)?, loss_db) as f32)
 }
 
 /// Returns the stored share of all tokens.
-fn share(scene: &Scene) -> Result<f64, EvalError> {
+fn share(scene: &Scene) -> Result<f64, SceneError> {
     let all = scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?;
     Ok(scene.num_tokens() as f64 / all as f64)
 }

@@ -3,11 +3,10 @@
 use std::path::PathBuf;
 
 use clift_core::{DMat3, DVec3, Intrinsics, Pose};
+use clift_model::ModelError;
 use safetensors::SafeTensors;
 
 use super::*;
-use crate::error::ModelError;
-use crate::network::architecture::CliftVariant;
 use crate::testing::small_lvsm;
 
 const DIM: usize = 8;
@@ -102,7 +101,7 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
 #[test]
 fn latents_are_stored_without_places() {
     let folder = Folder::new();
-    let model = ModelConfig { dim: DIM, num_heads: 2, num_latents: 5, ..small_lvsm(CliftVariant::Paper) };
+    let model = ModelConfig { dim: DIM, num_heads: 2, num_latents: 5, ..small_lvsm() };
     let latents = Scene { kind: TokenKind::All, model, token_ids: (0..5).collect(), ..scene() };
     for format in TokenFormat::ALL {
         latents.write(&folder.path(), format).expect("writes");

@@ -21,11 +21,10 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use clift_core::replace_file;
+use clift_model::{ModelConfig, ModelError};
 
 use crate::codec::prediction::Places;
 use crate::codec::token_codec::TokenCodec;
-use crate::error::ModelError;
-use crate::network::config::ModelConfig;
 use crate::scene::coded_views::{read_views, read_world, write_views, write_world};
 use crate::scene::header::{COPY_AGAIN, Fields, GIVE_MODEL, Refusal, refusal, write_fields};
 use crate::scene::scene::{CODED_VERSION, FORMAT, Scene};

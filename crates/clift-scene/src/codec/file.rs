@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use clift_core::replace_file;
+use clift_model::{ModelConfig, ModelError, TokenKind, parse_variant, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
 use safetensors::{SafeTensors, serialize};
 use sha2::{Digest, Sha256};
@@ -13,12 +14,7 @@ use crate::codec::prediction::{NUM_CLASSES, Prediction};
 use crate::codec::rates::RateTable;
 use crate::codec::token_codec::TokenCodec;
 use crate::codec::transform::Transform;
-use crate::error::ModelError;
-use crate::names::parse;
-use crate::network::config::ModelConfig;
-use crate::tokens::kind::TokenKind;
-use crate::weights::file::sorted_header;
-use crate::weights::tensors::Tensors;
+use crate::tensors::Tensors;
 
 const FORMAT: &str = "clift-codec";
 const VERSION: &str = "2";
@@ -151,7 +147,7 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
         serde_json::from_str(field("model")?).map_err(|error| format!("unreadable `model` ({error})"))?;
     model.validate().map_err(|error| error.to_string())?;
     let kind = field("kind")?;
-    let kind = parse(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
+    let kind = parse_variant(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
     let file = Tensors(file);
     let f64s = |name: &str, shape: &[usize]| file.f64s(name, shape);
     let f32s = |name: &str, shape: &[usize]| {

@@ -6,22 +6,12 @@ use std::time::Instant;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::Camera;
+use clift_model::{
+    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, Tokens,
+    interleaved, open_renderer, phases, render_bytes, renderer_hash,
+};
 
-use crate::cost::memory::render_bytes;
-use crate::error::ModelError;
-use crate::network::camera_encoding::TransformMaker;
-use crate::network::config::ModelConfig;
-use crate::network::parts::renderer::Renderer;
-use crate::network::render_tokens::KeyValueCache;
-use crate::network::tokens::Tokens;
 use crate::scene::scene::Scene;
-use crate::tokens::selection::rules::SelectionRules;
-use crate::tokens::selection::selector::Selector;
-use crate::views::interleave::{interleaved, parts};
-use crate::views::patch_grids::PatchGrids;
-use crate::views::upload::Cameras;
-use crate::weights::hash::renderer_hash;
-use crate::weights::trained_model::open_renderer;
 
 /// Most frames of one call with all tokens, where frames share keys and values.
 const FRAMES_PER_CALL: usize = 8;
@@ -35,7 +25,7 @@ pub fn frames_per_call(num_patches: usize) -> usize {
 
 /// Returns the peak bytes of tensors, without weights, while one call renders frames of a scene with the network `model`.
 pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [height, width]: [usize; 2]) -> u64 {
-    let (k, size) = parts(scene.height, model.patch_size, [height, width]);
+    let (k, size) = phases(scene.height, model.patch_size, [height, width]);
     let grids = model.patch_grids.patches(model.patch_size, size.map(|side| side / model.patch_size));
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
     let num_images = k * k * num_frames;
@@ -93,9 +83,7 @@ impl SceneRenderer {
         let shape = [1, scene.num_tokens(), scene.model.dim];
         let values = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
         let context = Cameras::of_views(&scene.context, scene.height, scene.width, device)?;
-        let transforms = TransformMaker::new(&scene.model).of_views(&context);
-        let transforms = transforms.map(|transforms| transforms.select(&scene.token_ids));
-        let tokens = Tokens { values, transforms };
+        let tokens = Tokens::of_patches(&scene.model, values, &context, &scene.token_ids);
         let selector = Selector::new(rules, &scene.token_rays())?;
         let cache = renderer.project_tokens(tokens);
         let (has_patch_tokens, trained_height) = (scene.model.has_patch_tokens(), scene.height);
@@ -198,13 +186,11 @@ impl SceneRenderer {
 
 #[cfg(test)]
 mod tests {
+    use clift_model::{CameraEncoding, Clift, SelectionPreset, save_weights};
+
     use super::*;
-    use crate::network::architecture::CameraEncoding;
-    use crate::network::model::Clift;
     use crate::scene::scene::tests::{camera, scene};
     use crate::testing::devices;
-    use crate::tokens::selection::rules::SelectionPreset;
-    use crate::weights::file::save_weights;
 
     fn config() -> ModelConfig {
         encoded(CameraEncoding::Plucker)
@@ -243,7 +229,6 @@ mod tests {
         let renderer = Clift::new(config, 3, device).renderer;
         let scene = whole_scene(&renderer, config);
         let context = Cameras::of_views(&scene.context, scene.height, scene.width, device).unwrap();
-        let transforms = TransformMaker::new(config).of_views(&context);
         let mut scene_renderer = SceneRenderer::new(&scene, renderer.clone(), preset.rules(), device).unwrap();
         let mut selector = Selector::new(preset.rules(), &scene.token_rays()).unwrap();
         let rendered = scene_renderer.render(&path(11), 16, 24, count).unwrap();
@@ -254,8 +239,7 @@ mod tests {
             let ids = selected.unwrap_or_else(|| (0..12).collect());
             let values = ids.iter().flat_map(|&id| &scene.tokens[id as usize * 16..][..16]).copied();
             let values = TensorData::new(values.collect::<Vec<f32>>(), [1, count, 16]);
-            let transforms = transforms.as_ref().map(|transforms| transforms.select(&ids));
-            let tokens = Tokens { values: Tensor::from_data(values, device), transforms };
+            let tokens = Tokens::of_patches(config, Tensor::from_data(values, device), &context, &ids);
             let cameras = Cameras::of_views(&[*view], 16, 24, device).unwrap();
             let alone = renderer.forward(tokens, &cameras).into_data().convert::<f32>();
             let alone = alone.as_slice::<f32>().unwrap();

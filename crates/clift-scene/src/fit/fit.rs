@@ -8,16 +8,16 @@ use std::ops::Range;
 use burn::tensor::Tensor;
 use clift_core::{derive_seed, item_rng, mean};
 use clift_data::{Clip, ClipReader, EvaluationItem};
-use clift_model::{
-    Cameras, Histograms, KMeans, LevelCounts, Moments, NeighbourProducts, Places, RateTable, TokenCodec, TokenCount,
-    TokenKind, Tokens, TrainedModel, Transform, Views, psnr_of_mse,
-};
+use clift_model::{Cameras, KMeans, ModelError, TokenCount, TokenKind, Tokens, TrainedModel, Views, psnr_of_mse};
 use rand::RngExt;
 
-use crate::encode::host_values;
-use crate::error::EvalError;
-use crate::evaluator::progress::EvalProgress;
-use crate::sweep::compressed_tokens::with_values;
+use crate::codec::histogram::Histograms;
+use crate::codec::prediction::{NeighbourProducts, Places};
+use crate::codec::rates::RateTable;
+use crate::codec::token_codec::{LevelCounts, TokenCodec};
+use crate::codec::transform::{Moments, Transform};
+use crate::error::SceneError;
+use crate::fit::progress::FitProgress;
 
 /// Most scenes that transform and distributions are fitted on; each is read three times, with one of the counts.
 const MAX_FITTED_SCENES: usize = 64;
@@ -61,15 +61,15 @@ pub struct FittedCodec {
 /// training scenes. Tokens of one scene are in memory at a time.
 ///
 /// # Errors
-/// [`EvalError::NoScenes`] without readable scenes, [`EvalError::Interrupted`] when `progress` requests a stop, and the
+/// [`SceneError::NoScenes`] without readable scenes, [`SceneError::Interrupted`] when `progress` requests a stop, and the
 /// errors of the model.
 pub fn fit_codec(
     model: &TrainedModel,
     reader: &ClipReader,
     items: &[EvaluationItem],
     options: &CodecOptions,
-    progress: &mut dyn EvalProgress,
-) -> Result<FittedCodec, EvalError> {
+    progress: &mut dyn FitProgress,
+) -> Result<FittedCodec, SceneError> {
     let num_fitted = items.len().min(MAX_FITTED_SCENES);
     let measured = &items[..items.len().min(MAX_MEASURED_SCENES)];
     let total = 3 * num_fitted + 2 * measured.len();
@@ -85,7 +85,7 @@ pub fn fit_codec(
         }
     }
     if num_scenes == 0 {
-        return Err(EvalError::NoScenes { reason: "no training scene for the token codec is readable".into() });
+        return Err(SceneError::NoScenes { reason: "no training scene for the token codec is readable".into() });
     }
     let mut transform = moments.transform();
     let mut effects = vec![Vec::new(); direction_groups(model.config.dim).len()];
@@ -112,7 +112,7 @@ pub fn fit_codec(
     }
     let deviation = mean_variance(&transform).sqrt();
     if deviation == 0.0 {
-        return Err(EvalError::NoScenes { reason: "all tokens of the training scenes are equal".into() });
+        return Err(SceneError::NoScenes { reason: "all tokens of the training scenes are equal".into() });
     }
     let steps: Vec<f64> = STEPS.iter().map(|factor| factor * deviation).collect();
 
@@ -136,7 +136,7 @@ pub fn fit_codec(
     }
     if num_measured == 0 {
         let reason = format!("none of the first {} training scenes is readable", measured.len());
-        return Err(EvalError::NoScenes { reason });
+        return Err(SceneError::NoScenes { reason });
     }
     let table = rates.table()?;
     let codec = TokenCodec::new(network, (codec.transform, codec.prediction), codec.distributions, table)?;
@@ -150,16 +150,16 @@ struct Fit<'a> {
     model: &'a TrainedModel,
     reader: &'a ClipReader,
     options: &'a CodecOptions,
-    progress: &'a mut dyn EvalProgress,
+    progress: &'a mut dyn FitProgress,
     done: usize,
     total: usize,
 }
 
 impl Fit<'_> {
     /// Reads the next scene; `None` for a scene that cannot be read.
-    fn read(&mut self, item: &EvaluationItem) -> Result<Option<Clip>, EvalError> {
+    fn read(&mut self, item: &EvaluationItem) -> Result<Option<Clip>, SceneError> {
         if self.progress.is_interrupted() {
-            return Err(EvalError::Interrupted { done: self.done, total: self.total });
+            return Err(SceneError::Interrupted { done: self.done, total: self.total });
         }
         self.done += 1;
         let clip = self.reader.read(item.scene, &item.views);
@@ -171,11 +171,11 @@ impl Fit<'_> {
     }
 
     /// Returns the stored tokens of a scene, `[S, D]`, at one of the counts, and their patches.
-    fn tokens(&self, clip: &Clip, index: usize) -> Result<(Vec<f32>, Vec<u32>), EvalError> {
+    fn tokens(&self, clip: &Clip, index: usize) -> Result<(Vec<f32>, Vec<u32>), SceneError> {
         let lift = self.model.network.encode(&Views::upload(&[&clip.context], &self.model.device)?);
         let count = self.options.counts[index % self.options.counts.len()];
         let (tokens, ids) = self.stored(&lift, count, clip)?;
-        Ok((host_values(&tokens)?, ids))
+        Ok((tokens.to_host()?, ids))
     }
 
     fn places<'a>(&self, ids: &'a [u32], clip: &Clip) -> Places<'a> {
@@ -184,7 +184,7 @@ impl Fit<'_> {
     }
 
     /// Clusters and condenses encoder tokens `[1, N, D]`; returns the tokens and their patches.
-    fn stored(&self, lift: &Tokens, count: TokenCount, clip: &Clip) -> Result<(Tokens, Vec<u32>), EvalError> {
+    fn stored(&self, lift: &Tokens, count: TokenCount, clip: &Clip) -> Result<(Tokens, Vec<u32>), SceneError> {
         let [_, num_tokens, _] = lift.dims();
         let seed = derive_seed(self.options.seed, &clip.key);
         // A scene of fewer tokens stores all of them.
@@ -201,9 +201,9 @@ impl Fit<'_> {
     }
 
     /// Renders the targets of a clip, `[V, height, width, 3]`.
-    fn render(&self, tokens: Tokens, cameras: &Cameras) -> Result<Vec<f32>, EvalError> {
+    fn render(&self, tokens: Tokens, cameras: &Cameras) -> Result<Vec<f32>, SceneError> {
         let images: Tensor<5> = self.model.network.render(tokens, cameras); // [1, V, H, W, 3]
-        images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+        images.into_data().convert::<f32>().try_to_vec().map_err(|error| ModelError::device(error).into())
     }
 
     /// Adds the mean squared change of renderings of a scene, at one of the counts, by noise along each group of directions.
@@ -213,12 +213,12 @@ impl Fit<'_> {
         index: usize,
         transform: &Transform,
         effects: &mut [Vec<f64>],
-    ) -> Result<(), EvalError> {
+    ) -> Result<(), SceneError> {
         let device = &self.model.device;
         let lift = self.model.network.encode(&Views::upload(&[&clip.context], device)?);
         let cameras = Cameras::upload(&[&clip.target], device)?;
         let (tokens, _) = self.stored(&lift, self.options.counts[index % self.options.counts.len()], clip)?;
-        let (values, exact) = (host_values(&tokens)?, self.render(tokens.clone(), &cameras)?);
+        let (values, exact) = (tokens.to_host()?, self.render(tokens.clone(), &cameras)?);
         let dim = transform.mean.len();
         let mut rng = item_rng(self.options.seed, index as u64, 0, 0, "codec noise");
         for (group, effects) in direction_groups(dim).into_iter().zip(effects) {
@@ -231,14 +231,14 @@ impl Fit<'_> {
                     token.iter_mut().zip(transform.direction(direction)).for_each(|(value, x)| *value += noise * x);
                 }
             }
-            let changed = self.render(with_values(tokens.clone(), noisy), &cameras)?;
+            let changed = self.render(tokens.with_host_values(noisy), &cameras)?;
             effects.push(view_errors(&changed, &exact, exact.len())[0]);
         }
         Ok(())
     }
 
     /// Adds bits and losses of a scene at every count and step.
-    fn measure(&self, clip: &Clip, codec: &TokenCodec, rates: &mut Measured) -> Result<(), EvalError> {
+    fn measure(&self, clip: &Clip, codec: &TokenCodec, rates: &mut Measured) -> Result<(), SceneError> {
         let device = &self.model.device;
         let lift = self.model.network.encode(&Views::upload(&[&clip.context], device)?);
         let cameras = Cameras::upload(&[&clip.target], device)?;
@@ -248,7 +248,7 @@ impl Fit<'_> {
         for (c, &count) in self.options.counts.iter().enumerate() {
             let (tokens, ids) = self.stored(&lift, count, clip)?;
             let places = self.places(&ids, clip);
-            let values = host_values(&tokens)?;
+            let values = tokens.to_host()?;
             let (num_tokens, exact) = (tokens.dims()[1], render(tokens.clone())?);
             let errors = view_errors(&exact, &truth, view_len);
             let psnr: Vec<f64> = errors.iter().map(|&error| psnr_of_mse(error)).collect();
@@ -257,7 +257,7 @@ impl Fit<'_> {
             for k in 0..rates.steps.len() {
                 let step = rates.steps[k] as f32;
                 let bits = codec.count_bits(&values, places, step, &mut rates.levels[k])?;
-                let rounded = render(with_values(tokens.clone(), codec.round(&values, places, step)?))?;
+                let rounded = render(tokens.with_host_values(codec.round(&values, places, step)?))?;
                 rates.loss[c][k].push(loss(&exact, &rounded, &errors));
                 rates.bits[c][k].push(bits / num_tokens as f64);
                 rates.stream_bits[k] += bits;
@@ -337,7 +337,7 @@ impl Measured {
     }
 
     /// Returns the means, in the order of counts.
-    fn table(&self) -> Result<RateTable, EvalError> {
+    fn table(&self) -> Result<RateTable, SceneError> {
         let of = |values: &Vec<f64>| mean(values).unwrap_or(f64::NAN);
         let mut order: Vec<usize> = (0..self.shares.len()).collect();
         order.sort_by(|&a, &b| of(&self.shares[a]).total_cmp(&of(&self.shares[b])));

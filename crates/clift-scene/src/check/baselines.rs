@@ -2,40 +2,40 @@
 
 use clift_core::{Camera, ClipViews, Pose};
 
-use crate::error::EvalError;
+use crate::error::SceneError;
 
 /// Tolerance of a tie, relative to the largest distance or in radians. Rounding must not decide between cameras that
 /// rotate in place.
 const TIE: f64 = 1e-9;
 
 /// Finds the nearest camera centre. Ties go to the smaller rotation angle, then to the lower index.
-pub fn nearest_view(context: &[Camera], target: Pose) -> Result<usize, EvalError> {
+pub fn nearest_view(context: &[Camera], target: Pose) -> Result<usize, SceneError> {
     let distances: Vec<f64> =
         context.iter().map(|camera| camera.c2w.translation.distance(target.translation)).collect();
-    let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
+    let nearest = distances.iter().copied().reduce(f64::min).ok_or(SceneError::NoContext)?;
     let tie = TIE * distances.iter().copied().fold(0.0, f64::max);
     let near: Vec<usize> = (0..distances.len()).filter(|&i| distances[i] <= nearest + tie).collect();
     let angles: Vec<f64> = near.iter().map(|&i| context[i].c2w.angle_to(target)).collect();
     let smallest = angles.iter().copied().fold(f64::INFINITY, f64::min);
-    let first = angles.iter().position(|&angle| angle <= smallest + TIE).ok_or(EvalError::NoContext)?;
+    let first = angles.iter().position(|&angle| angle <= smallest + TIE).ok_or(SceneError::NoContext)?;
     Ok(near[first])
 }
 
 /// Returns the image of a view, `[height, width, 3]` in `[0, 1]`.
-pub(crate) fn view_image(views: &ClipViews, view: usize) -> Vec<f32> {
+pub fn view_image(views: &ClipViews, view: usize) -> Vec<f32> {
     let len = views.height * views.width * 3;
     views.images[view * len..][..len].iter().map(|&value| f32::from(value) / 255.0).collect()
 }
 
 /// Returns the image of the nearest context view, `[height, width, 3]` in [0, 1].
-pub fn nearest_image(context: &ClipViews, target: Pose) -> Result<Vec<f32>, EvalError> {
+pub fn nearest_image(context: &ClipViews, target: Pose) -> Result<Vec<f32>, SceneError> {
     Ok(view_image(context, nearest_view(&context.cameras, target)?))
 }
 
 /// Returns the mean of the context images, `[height, width, 3]` in [0, 1].
-pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
+pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, SceneError> {
     if context.num_views() == 0 {
-        return Err(EvalError::NoContext);
+        return Err(SceneError::NoContext);
     }
     let mut sums = vec![0_u32; context.height * context.width * 3];
     for image in context.images.chunks_exact(sums.len()) {
@@ -49,17 +49,18 @@ pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
 
 #[cfg(test)]
 mod tests {
-    use clift_core::{DMat3, DVec3};
+    use clift_core::{DMat3, DVec3, Intrinsics};
 
     use super::*;
-    use crate::testing::gray_views;
 
     fn pose(x: f64, yaw_deg: f64) -> Pose {
         Pose { rotation: DMat3::from_rotation_y(yaw_deg.to_radians()), translation: x * DVec3::X }
     }
 
     fn views(poses: &[Pose], images: Vec<u8>) -> ClipViews {
-        ClipViews { images, ..gray_views((1, 1), 0, poses.to_vec(), (0..poses.len()).collect()) }
+        let intrinsics = Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 };
+        let cameras = poses.iter().map(|&c2w| Camera { c2w, intrinsics }).collect();
+        ClipViews { width: 1, height: 1, images, cameras, frame_index: (0..poses.len()).collect() }
     }
 
     #[test]
@@ -89,7 +90,7 @@ mod tests {
         assert_eq!(mean_image(&context).unwrap(), [0.5, 0.3, 1.0]);
         assert_eq!(nearest_image(&context, pose(0.9, 0.0)).unwrap(), [1.0, 0.4, 1.0]);
         let empty = views(&[], Vec::new());
-        assert!(matches!(mean_image(&empty), Err(EvalError::NoContext)));
-        assert!(matches!(nearest_image(&empty, Pose::IDENTITY), Err(EvalError::NoContext)));
+        assert!(matches!(mean_image(&empty), Err(SceneError::NoContext)));
+        assert!(matches!(nearest_image(&empty, Pose::IDENTITY), Err(SceneError::NoContext)));
     }
 }

@@ -1,7 +1,7 @@
 //! Bits and loss of coded tokens, measured on renderings by token count and step when the codec is fitted.
 // C counts, K steps
 
-use crate::error::ModelError;
+use clift_model::ModelError;
 
 /// Measured rates and losses, and rules that choose count and step by them.
 #[derive(Clone, Debug, PartialEq)]

@@ -22,11 +22,9 @@
 // S storage tokens, V context views, D width
 
 use clift_core::{Camera, PoseNormalization};
+use clift_model::{ModelConfig, TokenKind, TokenRay};
 
-use crate::network::config::ModelConfig;
 use crate::scene::token_format::TokenFormat;
-use crate::tokens::kind::TokenKind;
-use crate::tokens::selection::token_ray::TokenRay;
 
 /// Length of the header of a scene file in bytes.
 pub const HEADER_BYTES: usize = 2048;
@@ -46,7 +44,7 @@ pub struct Scene {
     pub kind: TokenKind,
     /// Sizes and variant of the network.
     pub model: ModelConfig,
-    /// Hash of the renderer, see [`TrainedModel::renderer_hash`](crate::TrainedModel::renderer_hash).
+    /// Hash of the renderer, see [`TrainedModel::renderer_hash`](clift_model::TrainedModel::renderer_hash).
     pub renderer_hash: String,
     /// Path of the run or weight file that encoded the scene, relative to the folder of the scene file, or absolute. See
     /// [`Scene::find_model`].

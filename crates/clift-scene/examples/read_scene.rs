@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use clift_model::Scene;
+use clift_scene::Scene;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let path = std::env::args().nth(1).ok_or("usage: read_scene SCENE.clift")?;

@@ -4,16 +4,14 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use clift_model::{ModelConfig, ModelError, TokenKind, TrainedModel};
+
 use crate::codec::entropy::{Decoder, Encoder, decode_ids, encode_ids};
 use crate::codec::histogram::Distributions;
 use crate::codec::prediction::{NUM_CLASSES, Neighbours, Places, Prediction};
 use crate::codec::rates::RateTable;
 use crate::codec::table::{MIN_BITS, Table};
 use crate::codec::transform::Transform;
-use crate::error::ModelError;
-use crate::network::config::ModelConfig;
-use crate::tokens::kind::TokenKind;
-use crate::weights::trained_model::TrainedModel;
 
 /// Squared steps that a bit is worth: the slope of distortion against rate of a fine uniform quantizer, `2 ln 2 / 12`.
 const BIT_VALUE: f32 = 0.1155;
@@ -29,7 +27,7 @@ pub struct TokenCodec {
     pub model: ModelConfig,
     /// Kind of the tokens.
     pub kind: TokenKind,
-    /// Hash of the renderer, see [`TrainedModel::renderer_hash`](crate::TrainedModel::renderer_hash).
+    /// Hash of the renderer, see [`TrainedModel::renderer_hash`](clift_model::TrainedModel::renderer_hash).
     pub renderer_hash: String,
     /// The transform.
     pub transform: Transform,

@@ -3,9 +3,9 @@
 use std::fmt;
 use std::str::FromStr;
 
+use clift_model::ModelError;
 use serde::{Deserialize, Serialize};
 
-use crate::error::ModelError;
 use crate::scene::token_format::TokenFormat;
 
 /// Storage of tokens in configs, tables and on the command line: `f32`, `f16`, `int8`, `coded` or `coded-DB`.
@@ -77,7 +77,7 @@ impl FromStr for TokenCoding {
             return Ok(Self::Coded(CodedLoss::default()));
         }
         let Some(loss) = name.strip_prefix("coded-") else {
-            let format = crate::names::parse(name).map(Self::Plain);
+            let format = clift_model::parse_variant(name).map(Self::Plain);
             return format.ok_or_else(|| bad(format!("write one of {}", Self::NAMES)));
         };
         match loss.parse() {

@@ -1,0 +1,5 @@
+//! Encoding of captured images.
+//!
+//! - `encode`: contexts, tokens, clusters, condenser
+
+pub(crate) mod encode;
