@@ -1,4 +1,4 @@
-//! Errors of metrics, sweeps, comparisons and reports.
+//! Errors of sweeps, comparisons and reports.
 
 use std::path::{Path, PathBuf};
 

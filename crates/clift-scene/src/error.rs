@@ -4,6 +4,12 @@
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SceneError {
+    /// A request that the scene or the model cannot meet.
+    #[error("{reason}")]
+    BadRequest {
+        /// The problem and the remedy.
+        reason: String,
+    },
     /// A scene without context views has no baseline.
     #[error("baselines need at least one context view, got none")]
     NoContext,
@@ -27,4 +33,10 @@ pub enum SceneError {
     /// The model refused its input, or a scene file or codec could not be read or written.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
+}
+
+impl SceneError {
+    pub(crate) fn request(reason: String) -> Self {
+        Self::BadRequest { reason }
+    }
 }

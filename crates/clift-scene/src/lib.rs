@@ -1,5 +1,6 @@
 //! Scenes of compressive light-field tokens: encode captured images, store the tokens in a file, render views from it.
 //!
+//! [`encode_scene`] does what `clift encode` does: it encodes images, writes the file and checks a rendering. Its steps:
 //! [`encode`] compresses images of a scene to a [`Scene`], [`Scene::write`] stores its tokens in a number format and
 //! [`Scene::write_coded`] with the [`TokenCodec`] of the model, which [`fit_codec`] fits on training scenes.
 //! [`SceneRenderer`] renders views, and [`HeldOutFrame`] compares a rendering with a photo.
@@ -19,7 +20,12 @@ mod testing;
 // Errors
 pub use error::SceneError;
 // Encode images
-pub use encode::encode::{EncodeOptions, EncodedScene, encode, spread_contexts};
+pub use encode::cluster_map::ClusterMap;
+pub use encode::coding::Coding;
+pub use encode::contexts::{MAX_TURN_DEG, default_num_context, spread_contexts};
+pub use encode::encode::{EncodeOptions, EncodedScene, encode};
+pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
+pub use encode::names::{find_scene, frame_positions};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;

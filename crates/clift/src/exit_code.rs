@@ -96,6 +96,7 @@ fn eval_exit_code(error: &EvalError) -> u8 {
 
 fn scene_exit_code(error: &SceneError) -> u8 {
     match error {
+        SceneError::BadRequest { .. } => USAGE,
         SceneError::Interrupted { .. } => interrupt::exit_code(),
         SceneError::Data(error) => data_exit_code(error),
         SceneError::Model(error) => model_exit_code(error),

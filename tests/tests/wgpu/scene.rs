@@ -56,7 +56,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let options = EncodeOptions {
         context: None,
         num_context: config.data.views.max_context,
-        stored_tokens: TokenCount::Count(STORED),
+        stored_tokens: Some(TokenCount::Count(STORED)),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,

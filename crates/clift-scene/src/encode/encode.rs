@@ -1,10 +1,11 @@
 //! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
-use clift_core::{Pose, PoseNormalization, derive_seed};
-use clift_data::{ClipReader, DataError, ViewIndices, contexts_along_path};
+use clift_core::derive_seed;
+use clift_data::{ClipReader, ViewIndices, ViewSampler};
 use clift_model::{Clusters, Grouping, KMeans, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
 
+use crate::encode::contexts::contexts;
 use crate::error::SceneError;
 use crate::scene::scene::Scene;
 
@@ -15,8 +16,8 @@ pub struct EncodeOptions {
     pub context: Option<Vec<usize>>,
     /// Number of context views without `context`, such as the number in training.
     pub num_context: usize,
-    /// Number of stored tokens.
-    pub stored_tokens: TokenCount,
+    /// Number of stored tokens; `None` for a quarter, or all tokens of a network without clusters.
+    pub stored_tokens: Option<TokenCount>,
     /// Token groups that the model was trained on.
     pub grouping: Grouping,
     /// Latent K-means.
@@ -25,6 +26,21 @@ pub struct EncodeOptions {
     pub seed: u64,
     /// Path of the model for the scene file, see [`Scene::model_path_for`].
     pub model_path: String,
+}
+
+impl Default for EncodeOptions {
+    /// The options for the default config of a run.
+    fn default() -> Self {
+        Self {
+            context: None,
+            num_context: ViewSampler::default().max_context,
+            stored_tokens: None,
+            grouping: Grouping::default(),
+            kmeans: KMeans::default(),
+            seed: 0,
+            model_path: String::new(),
+        }
+    }
 }
 
 /// An encoded scene.
@@ -60,16 +76,6 @@ impl EncodedScene {
     }
 }
 
-/// Chooses `num_views` context frames of a scene, or all its frames if it has fewer, at equal distances along the camera
-/// path, as [`encode`] does without [`EncodeOptions::context`].
-///
-/// # Errors
-/// Those of the cameras, and [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
-pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, SceneError> {
-    let (context, _) = contexts(reader, scene, None, num_views)?;
-    Ok(context)
-}
-
 /// Encodes a scene of `reader`. The groups equal those of `clift eval` for the same contexts and count.
 ///
 /// # Errors
@@ -92,14 +98,17 @@ pub fn encode(
     let architecture = model.config.architecture;
     let clusters = if architecture.supports_clusters() {
         let grid = [data.height, data.width].map(|side| side / model.config.patch_size);
-        let (count, kmeans) = (options.stored_tokens.of(num_lift_tokens)?, (&options.kmeans, seed));
+        let count = options.stored_tokens.unwrap_or(TokenCount::Share(0.25));
+        let (count, kmeans) = (count.of(num_lift_tokens)?, (&options.kmeans, seed));
         options.grouping.group(count, (clip.context.num_views(), grid), kmeans, || lift.values.clone())?
     } else {
-        if options.stored_tokens.of(num_lift_tokens)? != num_lift_tokens {
+        if let Some(count) = options.stored_tokens
+            && count.of(num_lift_tokens)? != num_lift_tokens
+        {
             let fix = format!(
                 "a scene of {architecture} is all its tokens, which are not clustered: write {num_lift_tokens}"
             );
-            return Err(bad_config("--stored-tokens", options.stored_tokens.to_string(), fix));
+            return Err(ModelError::BadConfig { key: "--stored-tokens", value: count.to_string(), fix }.into());
         }
         SceneClusters::identity(num_lift_tokens)
     };
@@ -130,65 +139,4 @@ pub fn encode(
         tokens,
     };
     Ok(EncodedScene { scene, num_lift_tokens, cluster_error, clusters })
-}
-
-/// Returns the context frames of a scene and the frame of its poses.
-fn contexts(
-    reader: &ClipReader,
-    scene: usize,
-    requested: Option<&[usize]>,
-    num_views: usize,
-) -> Result<(Vec<usize>, PoseNormalization), SceneError> {
-    let (key, data) = (reader.source.key(scene), &reader.options);
-    let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
-    let frames = context_frames(&poses, requested, num_views)?;
-    let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)
-        .map_err(DataError::from)?;
-    Ok((frames, normalization))
-}
-
-/// Checks the requested context frames, or chooses `num_views` frames along the camera path.
-fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, SceneError> {
-    let num_frames = poses.len();
-    let bad = |value: String, fix: String| bad_config("--context", value, fix);
-    let Some(requested) = requested else {
-        return contexts_along_path(poses, num_views.min(num_frames)).ok_or_else(|| {
-            bad(num_views.to_string(), format!("the scene has {num_frames} frames; list the frames to use"))
-        });
-    };
-    let list = requested.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
-    let mut sorted = requested.to_vec();
-    sorted.sort_unstable();
-    sorted.dedup();
-    if requested.len() < 2 || sorted.len() < requested.len() {
-        return Err(bad(list, "write at least two frames, each once".into()));
-    }
-    if let Some(frame) = requested.iter().find(|frame| **frame >= num_frames) {
-        let last = num_frames.saturating_sub(1);
-        return Err(bad(list, format!("there is no frame {frame}; the scene has frames 0 to {last}")));
-    }
-    Ok(requested.to_vec())
-}
-
-fn bad_config(key: &'static str, value: String, fix: String) -> SceneError {
-    ModelError::BadConfig { key, value, fix }.into()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn context_frames_are_checked_or_spread() {
-        let at = |x: f64| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY };
-        let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
-        assert_eq!(context_frames(&poses, None, 4).unwrap(), [0, 3, 6, 9]);
-        assert_eq!(context_frames(&poses[..3], None, 4).unwrap(), [0, 1, 2]);
-        assert_eq!(context_frames(&poses, Some(&[7, 2]), 4).unwrap(), [7, 2]);
-        let message = |frames: &[usize]| context_frames(&poses, Some(frames), 4).unwrap_err().to_string();
-        assert_eq!(message(&[0, 10]), "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9");
-        assert_eq!(message(&[3, 3]), "`--context` = 3,3: write at least two frames, each once");
-        assert_eq!(message(&[3]), "`--context` = 3: write at least two frames, each once");
-    }
 }

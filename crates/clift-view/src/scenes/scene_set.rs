@@ -120,7 +120,7 @@ impl RunScenes {
         let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
         let options = EncodeOptions {
             context: Some(views.context.clone()),
-            stored_tokens: TokenCount::Count(stored),
+            stored_tokens: Some(TokenCount::Count(stored)),
             ..self.options.clone()
         };
         let EncodedScene { mut scene, clusters, .. } = encode(&self.model, &self.reader, *index, &options)?;

@@ -122,7 +122,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let options = EncodeOptions {
         context: None,
         num_context: config.eval.num_context,
-        stored_tokens: config.eval.validation_stored_tokens,
+        stored_tokens: Some(config.eval.validation_stored_tokens),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
