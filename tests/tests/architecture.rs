@@ -7,44 +7,45 @@ use crate::support::{repository, sources};
 /// A crate, the crates that it may use, and its folders and root files: each imports only those that stand before it.
 type Crate = (&'static str, &'static str, &'static str);
 
-const CRATES: [Crate; 9] = [
+const CRATES: [Crate; 10] = [
     ("clift-core", "", "error statistics random rgb_image files geometry clip_views"),
     (
         "clift-kernels",
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights codec scene"),
+    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights metrics"),
     (
         "clift-data",
         "clift-core",
         "error skip_report files geometry image torch scene_source synthetic sources sampling config \
          tools dataset",
     ),
+    ("clift-scene", "clift-core clift-kernels clift-model clift-data", "error tensors codec scene check fit encode"),
     (
         "clift-eval",
-        "clift-core clift-kernels clift-model clift-data",
-        "error system config metrics statistics encode sweep figures report evaluator codec",
+        "clift-core clift-kernels clift-model clift-data clift-scene",
+        "error system config statistics sweep figures report evaluator",
     ),
     (
         "clift-train",
-        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "clift-core clift-kernels clift-model clift-data clift-scene clift-eval",
         "error version distributed events config step cluster_cache interchange stage checkpoint footprint \
          fit_token_codec run",
     ),
     (
         "clift-bench",
-        "clift-core clift-kernels clift-model clift-data clift-eval clift-train",
+        "clift-core clift-kernels clift-model clift-data clift-scene clift-eval clift-train",
         "allreduce cases data_reading runner precision doctor",
     ),
     (
         "clift-view",
-        "clift-core clift-kernels clift-model clift-data clift-eval",
+        "clift-core clift-kernels clift-model clift-data clift-scene clift-eval",
         "error protocol scenes session server",
     ),
     (
         "clift",
-        "clift-core clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
+        "clift-core clift-kernels clift-model clift-data clift-scene clift-eval clift-train clift-bench clift-view",
         "interrupt exit_code output threads commands cli reference_pages",
     ),
 ];

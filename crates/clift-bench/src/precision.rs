@@ -3,8 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clift_core::{BadConfig, median};
-use clift_eval::psnr_of_mse;
-use clift_model::{DeviceName, Precision};
+use clift_model::{DeviceName, Precision, psnr_of_mse};
 use clift_train::{Config, Stage, TrainError, freeze};
 use serde::Serialize;
 

@@ -11,10 +11,9 @@ use std::error::Error;
 use std::path::Path;
 
 use clift_data::{ClipReader, DataConfig, DatasetRoot, SourceOptions, Split, open_source};
-use clift_eval::{Canvas, EncodeOptions, HeldOutFrame, encode};
-use clift_model::{
-    DeviceName, Grouping, KMeans, ModelPath, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel,
-};
+use clift_eval::Canvas;
+use clift_model::{DeviceName, ModelPath, SelectionPreset, TrainedModel};
+use clift_scene::{Coding, EncodeOptions, SceneOptions, SceneRenderer, TokenFormat, encode_scene};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -29,26 +28,23 @@ fn main() -> Result<(), Box<dyn Error>> {
     let reader = ClipReader { source, options: data.clip_options() };
 
     // Encode the first scene: four context views, a quarter of the tokens, stored as f16.
-    let options = EncodeOptions {
-        context: None,
-        num_context: 4,
-        stored_tokens: TokenCount::Share(0.25),
-        grouping: Grouping::Kmeans,
-        kmeans: KMeans::default(),
-        seed: 0,
-        model_path: run.clone(),
+    let options = SceneOptions {
+        encode: EncodeOptions { num_context: 4, model_path: run.clone(), ..EncodeOptions::default() },
+        coding: Some(Coding::Plain(TokenFormat::F16)),
+        weights: path.weights,
+        out: format!("{out}.clift").into(),
     };
-    let scene = encode(&model, &reader, 0, &options)?.scene;
-    scene.write(Path::new(&format!("{out}.clift")), TokenFormat::F16)?;
+    let written = encode_scene(&model, &reader, 0, &options)?;
+    let scene = &written.encoded.scene;
 
     // Render the second context view from half of the stored tokens: those nearest to its camera.
     let (renderer, rules) = (model.network.renderer.clone(), SelectionPreset::default().rules());
-    let mut renderer = SceneRenderer::new(&scene, renderer, rules, &model.device)?;
+    let mut renderer = SceneRenderer::new(scene, renderer, rules, &model.device)?;
     let view = renderer.render(&scene.context[1..2], scene.height, scene.width, scene.num_tokens() / 2)?.remove(0);
     Canvas::from_unit(&view.pixels, scene.width, scene.height)?.write_png(Path::new(&format!("{out}.png")))?;
 
-    // Compare a rendering of a photo that is not a context view with the photo.
-    if let Some(check) = HeldOutFrame::render(&model, &reader, 0, &scene)? {
+    // A rendering of a photo that is not a context view, compared with the photo.
+    if let Some(check) = written.held_out {
         println!("frame {}: {:.2} dB, the nearest context view {:.2} dB", check.frame, check.psnr, check.nearest_psnr);
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! Errors of metrics, sweeps, comparisons and reports.
+//! Errors of sweeps, comparisons and reports.
 
 use std::path::{Path, PathBuf};
 
@@ -22,18 +22,6 @@ pub enum EvalError {
     BadImage {
         /// The problem.
         reason: String,
-    },
-    /// The weight file of a metric or loss is not usable.
-    #[error("bad weights for {what}: {reason}; make the file with `{command}`: {path}", path = path.display())]
-    BadWeights {
-        /// The metric or loss.
-        what: &'static str,
-        /// The problem.
-        reason: String,
-        /// Command that makes the file.
-        command: &'static str,
-        /// The file.
-        path: PathBuf,
     },
     /// The name of an external method is not allowed.
     #[error("bad method name `{name}`: {reason}")]
@@ -75,9 +63,6 @@ pub enum EvalError {
         /// The evaluation.
         path: PathBuf,
     },
-    /// A scene without context views has no baseline.
-    #[error("baselines need at least one context view, got none")]
-    NoContext,
     /// No model renders a method.
     #[error("no weights for the method `{method}`")]
     NoModel {
@@ -110,6 +95,9 @@ pub enum EvalError {
     /// The model refused its input or its weights.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
+    /// A baseline or a scene file could not be made.
+    #[error(transparent)]
+    Scene(#[from] clift_scene::SceneError),
     /// A tensor could not be read back from its device.
     #[error("reading a tensor from its device failed: {reason}")]
     Tensor {

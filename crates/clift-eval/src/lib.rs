@@ -1,32 +1,12 @@
-//! Evaluation of compressive light-field tokens: encode images, render views, measure quality and cost, write reports.
+//! Evaluation of compressive light-field tokens: render views, measure quality and cost, write reports.
 //!
-//! [`encode`] compresses captured images to a scene. [`Evaluator`] measures trained models on test scenes with every method
-//! and token count, and writes tables, contact sheets and an HTML report. The metrics also work on plain slices:
-//!
-//! ```
-//! use clift_eval::{Canvas, psnr, ssim};
-//!
-//! # fn main() -> Result<(), clift_eval::EvalError> {
-//! let (height, width) = (16, 16);
-//! let target = vec![0.5; height * width * 3];
-//! let rendering: Vec<f32> = target.iter().map(|value| value + 0.1).collect();
-//! assert!((psnr(&rendering, &target)? - 20.0).abs() < 1e-3);
-//! assert!(ssim(&rendering, &target, height, width)? > 0.9);
-//! let image = Canvas::from_unit(&rendering, height, width)?;
-//! assert_eq!(image.pixel(0, 0), [153; 3]);
-//! # Ok(())
-//! # }
-//! ```
-//!
-//! The example `encode_and_render` encodes a folder of photos and renders a view.
+//! [`Evaluator`] measures trained models on test scenes with every method
+//! and token count, and writes tables, contact sheets and an HTML report.
 
-mod codec;
 mod config;
-mod encode;
 mod error;
 mod evaluator;
 mod figures;
-mod metrics;
 mod report;
 mod statistics;
 mod sweep;
@@ -36,19 +16,6 @@ mod testing;
 
 // Errors of all functions.
 pub use error::EvalError;
-
-// Encode images.
-pub use encode::{EncodeOptions, EncodedScene, encode, spread_contexts};
-
-// Metrics and the perceptual loss.
-pub use metrics::image_metrics::{psnr, psnr_of_mse, ssim};
-pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
-pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
-pub use metrics::vgg::VggShape;
-
-// The token codec of a model.
-pub use codec::fit::{CodecOptions, FittedCodec, fit_codec};
-pub use codec::step_choice::{expected_step, step_for_bytes, step_for_loss};
 
 // Settings of an evaluation.
 pub use config::eval_config::EvalConfig;
@@ -67,7 +34,6 @@ pub use report::training::TrainingCurve;
 // One scene with every method and token count.
 pub use sweep::eval_models::EvalModels;
 pub use sweep::evaluate_scene::evaluate_scene;
-pub use sweep::held_out_frame::HeldOutFrame;
 pub use sweep::predictions::{ExternalMethod, file_name};
 pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;

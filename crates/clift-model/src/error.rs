@@ -76,6 +76,24 @@ pub enum ModelError {
         /// The error of the device.
         reason: String,
     },
+    /// Image with another number of values than its target or shape, too small for a metric, or with a NaN or an infinity.
+    #[error("{reason}")]
+    BadImage {
+        /// The problem.
+        reason: String,
+    },
+    /// Weight file of a metric or loss that is not usable.
+    #[error("bad weights for {what}: {reason}; make the file with `{command}`: {path}", path = path.display())]
+    BadWeights {
+        /// The metric or loss.
+        what: &'static str,
+        /// The problem.
+        reason: String,
+        /// Command that makes the file.
+        command: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
     /// Scene file that cannot be written, or that is damaged or of another format.
     #[error("cannot {action} the scene: {reason}; {fix}: {path}", path = path.display())]
     SceneFile {
@@ -169,4 +187,11 @@ pub enum ModelError {
         /// The cause, with the tokens of the scene.
         reason: String,
     },
+}
+
+impl ModelError {
+    /// Makes the error of values that cannot be read back from their device.
+    pub fn device(error: impl std::fmt::Debug) -> Self {
+        Self::Device { reason: format!("{error:?}") }
+    }
 }

@@ -27,6 +27,19 @@
 //! assert_eq!(image.dims(), [1, 1, 16, 16, 3]);
 //! # Ok::<(), clift_model::ModelError>(())
 //! ```
+//!
+//! The metrics work on plain slices, `[height, width, 3]`:
+//!
+//! ```
+//! use clift_model::{psnr, ssim};
+//!
+//! let (height, width) = (16, 16);
+//! let target = vec![0.5; height * width * 3];
+//! let rendering: Vec<f32> = target.iter().map(|value| value + 0.1).collect();
+//! assert!((psnr(&rendering, &target)? - 20.0).abs() < 1e-3);
+//! assert!(ssim(&rendering, &target, height, width)? > 0.9);
+//! # Ok::<(), clift_model::ModelError>(())
+//! ```
 #![cfg_attr(
     feature = "ndarray",
     expect(
@@ -35,14 +48,13 @@
     )
 )]
 
-mod codec;
 mod cost;
 mod device;
 mod error;
+mod metrics;
 mod names;
 mod network;
 mod ops;
-mod scene;
 #[cfg(test)]
 mod testing;
 mod tokens;
@@ -51,13 +63,14 @@ mod weights;
 
 // Errors, and enums by name
 pub use error::ModelError;
-pub use names::parse_value;
+pub use names::{parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
 pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes};
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras
+pub use views::interleave::{interleaved, phases};
 pub use views::patch::{patchify, unpatchify};
 pub use views::patch_grids::PatchGrids;
 pub use views::rays::plucker;
@@ -95,30 +108,21 @@ pub use ops::linear::{gelu_linear, linear, norm_linear};
 // Parameters, multiply-accumulates and memory of a network
 pub use cost::largest_tensor::{kmeans_values, largest_tensors};
 pub use cost::macs::{FlopConvention, Macs};
-pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, update_bytes};
+pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
 pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
 pub use network::layers::Part;
+// Metrics of images, and the perceptual loss
+pub use metrics::image_metrics::{SSIM_MIN_SIZE_PX, check_images, psnr, psnr_of_mse, ssim};
+pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
+pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
+pub use metrics::vgg::{Pooling, VggShape, VggSizes};
 // Weight files and trained models
 pub use weights::file::{first_not_f32, load_part, save_part, save_part_f16, save_weights, sorted_header};
-pub use weights::hash::weights_hash;
+pub use weights::hash::{renderer_hash, weights_hash};
 pub use weights::model_path::{ModelPath, check_condenser, check_sizes, refuse_checkpoint};
 pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
-pub use weights::trained_model::TrainedModel;
-// The coder of tokens in scene files
-pub use codec::histogram::{Distributions, Histograms};
-pub use codec::prediction::{NeighbourProducts, Places, Prediction};
-pub use codec::rates::RateTable;
-pub use codec::token_codec::{LevelCounts, TokenCodec};
-pub use codec::transform::{Moments, Transform};
-// Scene files, and rendering from them
-pub use scene::check::MAX_SIDE_PX;
-pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{Scene, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
-pub use scene::token_coding::{CodedLoss, TokenCoding};
-pub use scene::token_format::TokenFormat;
-pub use scene::write::check_output_path;
+pub use weights::trained_model::{TrainedModel, open_renderer};

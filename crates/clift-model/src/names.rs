@@ -14,7 +14,8 @@ pub fn names<T: Named>() -> String {
     T::VARIANTS.iter().map(|&variant| variant.into()).collect::<Vec<&str>>().join(", ")
 }
 
-pub fn parse<T: Named>(name: &str) -> Option<T> {
+/// Returns the variant with a name.
+pub fn parse_variant<T: Named>(name: &str) -> Option<T> {
     T::VARIANTS.iter().copied().find(|&variant| variant.into() == name)
 }
 
@@ -23,7 +24,7 @@ pub fn parse<T: Named>(name: &str) -> Option<T> {
 /// # Errors
 /// [`ModelError::BadConfig`] with all names, for an unknown name.
 pub fn parse_value<T: Named>(key: &'static str, name: &str) -> Result<T, ModelError> {
-    parse(name).ok_or_else(|| ModelError::BadConfig {
+    parse_variant(name).ok_or_else(|| ModelError::BadConfig {
         key,
         value: name.into(),
         fix: format!("write one of {}", names::<T>()),
@@ -40,7 +41,6 @@ mod tests {
     use crate::device::name::DeviceName;
     use crate::network::architecture::CliftVariant;
     use crate::ops::precision::Precision;
-    use crate::scene::token_format::TokenFormat;
     use crate::tokens::kind::TokenKind;
     use crate::tokens::selection::rules::SelectionPreset;
 
@@ -63,7 +63,6 @@ mod tests {
         check::<Precision>("f32, bf16, f16");
         check::<SelectionPreset>("paper, global, scaled");
         check::<CliftVariant>("paper, released-re10k, released-dl3dv");
-        assert_eq!(names::<TokenFormat>(), "f32, f16, int8");
         assert_eq!(names::<TokenKind>(), "clift, kmeans, latents");
         let message = parse_value::<FlopConvention>("convention", "flop").unwrap_err().to_string();
         assert_eq!(message, "`convention` = flop: write one of paper, macs, flops");

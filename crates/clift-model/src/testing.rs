@@ -1,6 +1,6 @@
 //! Devices, fixtures, gradient checks and comparisons for the unit tests.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
@@ -76,8 +76,11 @@ pub struct Fixture {
 
 impl Fixture {
     pub fn open(name: &str) -> Self {
-        let path = Self::path(name);
-        Self { bytes: std::fs::read(&path).unwrap_or_else(|error| panic!("{error}: {}", path.display())) }
+        Self::read(&Self::path(name))
+    }
+
+    pub fn read(path: &Path) -> Self {
+        Self { bytes: std::fs::read(path).unwrap_or_else(|error| panic!("{error}: {}", path.display())) }
     }
 
     pub fn path(name: &str) -> PathBuf {
@@ -100,6 +103,14 @@ impl Fixture {
 
     pub fn integers(&self, name: &str) -> Vec<i64> {
         self.data(name).try_to_vec().expect("a tensor of i64")
+    }
+
+    pub fn f64s(&self, name: &str) -> Vec<f64> {
+        self.data(name).convert::<f64>().try_to_vec().expect("f64 after conversion")
+    }
+
+    pub fn f32s(&self, name: &str) -> Vec<f32> {
+        self.data(name).convert::<f32>().try_to_vec().expect("f32 after conversion")
     }
 
     pub fn shape(&self, name: &str) -> Vec<usize> {

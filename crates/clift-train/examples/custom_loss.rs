@@ -4,8 +4,7 @@
 //! `cargo run --release -p clift-train --example custom_loss`
 
 use burn::tensor::Tensor;
-use clift_eval::psnr_of_mse;
-use clift_model::{DeviceName, ModelConfig};
+use clift_model::{DeviceName, ModelConfig, psnr_of_mse};
 use clift_train::{
     ClipShape, Loss, LossTerm, OptimizerConfig, Rendering, TrainError, TrainState, seeded_batch, seeded_model,
 };

@@ -193,6 +193,9 @@ pub enum TrainError {
     /// Input or weights of the model are invalid.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
+    /// Coding tokens failed.
+    #[error(transparent)]
+    Scene(#[from] clift_scene::SceneError),
     /// Evaluation failed.
     #[error(transparent)]
     Eval(#[from] clift_eval::EvalError),

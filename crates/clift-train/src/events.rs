@@ -193,7 +193,7 @@ pub(crate) struct EvalEvents<'a> {
     pub sink: &'a mut dyn Sink,
     /// Ranks that share the scenes.
     pub ranks: &'a Ranks,
-    /// Whether scenes are counted: in an evaluation, not in a validation or the fit of a codec.
+    /// Whether scenes are counted: in an evaluation, not in a validation.
     pub is_stage: bool,
 }
 

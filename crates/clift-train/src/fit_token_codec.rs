@@ -1,20 +1,18 @@
 //! The token codec of a run or model, fitted after stage 2 or on demand.
 
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
 use clift_core::derive_seed;
 use clift_data::ClipReader;
-use clift_eval::{
-    CodecOptions, EvalConfig, EvalError, EvalFrames, EvalSplit, FittedCodec, evaluation_items, fit_codec,
-};
-use clift_model::{Grouping, ModelPath, TokenCodec, TrainedModel};
+use clift_eval::{EvalConfig, EvalError, EvalFrames, EvalSplit, evaluation_items};
+use clift_model::{Grouping, ModelPath, TrainedModel};
+use clift_scene::{CodecOptions, FitProgress, FittedCodec, SceneError, TokenCodec, fit_codec};
 
 use crate::config::config::Config;
-use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
-use crate::events::{EvalEvents, Event, Sink};
+use crate::events::{Event, Sink};
 
 /// Fits the token codec of a model on training scenes, with the token counts and views of `config.eval`, and writes the
 /// codec beside the weights.
@@ -53,13 +51,31 @@ pub fn fit_token_codec(
         kmeans: config.clusters.kmeans.clone(),
         seed: derive_seed(config.seed, "codec"),
     };
-    let mut progress = EvalEvents { stop, sink, ranks: &Ranks::single(), is_stage: false };
+    let mut progress = FitEvents { stop, sink };
     let fitted = fit_codec(model, reader, &items, &options, &mut progress).map_err(|error| match error {
-        EvalError::Interrupted { .. } => TrainError::Abandoned { task: "fitting the token codec".into() },
+        SceneError::Interrupted { .. } => TrainError::Abandoned { task: "fitting the token codec".into() },
         error => error.into(),
     })?;
     fitted.codec.write(&TokenCodec::path_of(weights))?;
     Ok(fitted)
+}
+
+/// Reports skipped scenes as events of a run.
+struct FitEvents<'a> {
+    stop: &'a AtomicBool,
+    sink: &'a mut dyn Sink,
+}
+
+impl FitProgress for FitEvents<'_> {
+    fn done(&mut self, _scenes: usize, _total: usize) {}
+
+    fn skipped(&mut self, key: &str, reason: &str) {
+        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
+    }
+
+    fn is_interrupted(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
 }
 
 /// Fits the codec of a run that has none of its weights. Scenes without views leave the run without a codec.
@@ -86,7 +102,7 @@ pub(crate) fn ensure_codec(
             sink.event(&Event::Message(format!("token codec: fitted on {num_scenes} training scenes")));
             Ok(())
         }
-        Err(TrainError::Eval(EvalError::NoScenes { reason })) => {
+        Err(TrainError::Eval(EvalError::NoScenes { reason }) | TrainError::Scene(SceneError::NoScenes { reason })) => {
             sink.event(&Event::Warning(format!("the token codec is not fitted: {reason}; fit it with `clift codec`")));
             Ok(())
         }

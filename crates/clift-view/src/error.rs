@@ -36,7 +36,10 @@ pub enum ViewError {
     /// Data could not be read or encoded.
     #[error(transparent)]
     Data(#[from] clift_data::DataError),
-    /// A scene could not be encoded or measured.
+    /// A scene could not be encoded.
+    #[error(transparent)]
+    Scene(#[from] clift_scene::SceneError),
+    /// An image could not be made.
     #[error(transparent)]
     Eval(#[from] clift_eval::EvalError),
     /// The model refused its input.

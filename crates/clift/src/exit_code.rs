@@ -3,6 +3,7 @@
 use clift_core::BadConfig;
 use clift_data::DataError;
 use clift_eval::EvalError;
+use clift_scene::SceneError;
 use clift_train::{ConfigError, TrainError};
 use clift_view::ViewError;
 
@@ -48,6 +49,9 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<EvalError>() {
         return eval_exit_code(error);
     }
+    if let Some(error) = error.downcast_ref::<SceneError>() {
+        return scene_exit_code(error);
+    }
     if let Some(error) = error.downcast_ref::<ViewError>() {
         return view_exit_code(error);
     }
@@ -62,6 +66,7 @@ fn train_exit_code(error: &TrainError) -> u8 {
         | TrainError::Missing { .. }
         | TrainError::NoMpi { .. } => USAGE,
         TrainError::Eval(error) => eval_exit_code(error),
+        TrainError::Scene(error) => scene_exit_code(error),
         TrainError::Data(error) => data_exit_code(error),
         TrainError::Model(error) => model_exit_code(error),
         TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => train_exit_code(source),
@@ -78,12 +83,23 @@ fn data_exit_code(error: &DataError) -> u8 {
 }
 
 fn eval_exit_code(error: &EvalError) -> u8 {
-    use EvalError::{BadMethodName, BadWeights, Interrupted, NoPredictions, NotComparable};
+    use EvalError::{BadMethodName, Interrupted, NoPredictions, NotComparable};
     match error {
         Interrupted { .. } => interrupt::exit_code(),
-        BadMethodName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
+        BadMethodName { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
         EvalError::Data(error) => data_exit_code(error),
         EvalError::Model(error) => model_exit_code(error),
+        EvalError::Scene(error) => scene_exit_code(error),
+        _ => FAILED,
+    }
+}
+
+fn scene_exit_code(error: &SceneError) -> u8 {
+    match error {
+        SceneError::BadRequest { .. } => USAGE,
+        SceneError::Interrupted { .. } => interrupt::exit_code(),
+        SceneError::Data(error) => data_exit_code(error),
+        SceneError::Model(error) => model_exit_code(error),
         _ => FAILED,
     }
 }
@@ -93,6 +109,7 @@ fn view_exit_code(error: &ViewError) -> u8 {
         ViewError::Bind { .. } => USAGE,
         ViewError::Data(error) => data_exit_code(error),
         ViewError::Eval(error) => eval_exit_code(error),
+        ViewError::Scene(error) => scene_exit_code(error),
         ViewError::Model(error) => model_exit_code(error),
         _ => FAILED,
     }
@@ -100,11 +117,13 @@ fn view_exit_code(error: &ViewError) -> u8 {
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {
     use clift_model::ModelError::{
-        BadConfig, BadTokenCount, NoCodec, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
+        BadConfig, BadTokenCount, BadWeights, NoCodec, NoConfig, NoDevice, NoModel, NotDivisible, NotImported,
+        OtherRenderer,
     };
     match error {
         BadConfig { .. }
         | BadTokenCount { .. }
+        | BadWeights { .. }
         | NoCodec { .. }
         | NoConfig { .. }
         | NoDevice { .. }

@@ -10,7 +10,8 @@ use clift_data::{
     ChunkSource, DatasetRoot, EvaluationIndex, Pickle, SceneFilters, SceneSource, SourceOptions, Split, TestScenes,
     decode_image, encode_jpeg, encode_png, open_source,
 };
-use clift_model::{Clift, CliftVariant, Scene, TokenCodec, load_part};
+use clift_model::{Clift, CliftVariant, load_part};
+use clift_scene::{Scene, TokenCodec};
 use clift_train::{
     CheckpointConfig, Checkpoints, ClusterCache, Config, ImportOptions, OptimizerConfig, Run, TrainState, import,
     read_checked_config,

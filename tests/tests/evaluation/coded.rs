@@ -1,6 +1,6 @@
 //! Coded scene files through the command line: fitted, encoded, evaluated, exported.
 
-use clift_model::{Scene, TokenCodec, TokenCoding};
+use clift_scene::{Scene, TokenCodec, TokenCoding};
 
 use crate::support::{LONGER, Place, STAGE_1, WHOLE, list, number};
 

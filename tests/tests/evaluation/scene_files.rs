@@ -3,10 +3,9 @@
 use std::process::Command;
 
 use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
-use clift_eval::{Canvas, psnr, ssim};
-use clift_model::{
-    Precision, Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer,
-};
+use clift_eval::Canvas;
+use clift_model::{Precision, SelectionPreset, TokenKind, psnr, ssim};
+use clift_scene::{Scene, SceneRenderer, TokenCoding, TokenFormat, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 

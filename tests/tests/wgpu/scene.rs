@@ -5,11 +5,8 @@ use std::path::Path;
 use burn::module::Module;
 use clift_core::{Camera, Pose};
 use clift_data::{ClipReader, DataConfig, Split, SyntheticConfig, ViewSampler, open_dataset};
-use clift_eval::{EncodeOptions, encode};
-use clift_model::{
-    CliftVariant, Scene, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel, load_renderer,
-    save_weights,
-};
+use clift_model::{CliftVariant, SelectionPreset, TokenCount, TrainedModel, save_weights};
+use clift_scene::{EncodeOptions, Scene, SceneRenderer, TokenFormat, encode, load_renderer};
 use clift_train::Config;
 
 use crate::cpu;
@@ -59,7 +56,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let options = EncodeOptions {
         context: None,
         num_context: config.data.views.max_context,
-        stored_tokens: TokenCount::Count(STORED),
+        stored_tokens: Some(TokenCount::Count(STORED)),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,

@@ -3,7 +3,8 @@
 use burn::tensor::Device;
 use clift_core::step_rng;
 use clift_data::DataConfig;
-use clift_model::{Histograms, NeighbourProducts, Places, RateTable, TokenCodec, TokenKind, Transform};
+use clift_model::TokenKind;
+use clift_scene::{Histograms, NeighbourProducts, Places, RateTable, TokenCodec, Transform};
 use clift_train::TrainError;
 use rand::RngExt;
 

@@ -3,7 +3,8 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use clift_model::{Precision, TokenCoding, TokenCount};
+use clift_model::{Precision, TokenCount};
+use clift_scene::TokenCoding;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::config::method::Method;

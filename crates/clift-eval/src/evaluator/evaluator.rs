@@ -5,7 +5,8 @@ use std::path::Path;
 use burn::tensor::Device;
 use clift_core::replace_file;
 use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural};
-use clift_model::{Architecture, ModelError, TokenCoding};
+use clift_model::{Architecture, LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, ModelError};
+use clift_scene::TokenCoding;
 
 use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
@@ -15,7 +16,6 @@ use crate::evaluator::items::evaluation_items;
 use crate::evaluator::progress::{EvalProgress, SharedScenes};
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
-use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 use crate::report::page::{MAX_FIGURES, Report, RunDescription};
 use crate::report::training::TrainingCurve;
 use crate::statistics::csv_files::{write_scenes, write_views};
@@ -86,7 +86,7 @@ impl Evaluator {
     /// `external_methods` too. The report has the curves of `training`.
     ///
     /// # Errors
-    /// As [`measure`](Self::measure), [`EvalError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a
+    /// As [`measure`](Self::measure), [`ModelError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a
     /// method without weights, [`EvalError::NoScenes`] when every scene failed, [`EvalError::NoPredictions`] for an external
     /// method without any image, and [`EvalError::Io`].
     pub fn evaluate(

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use clift_core::replace_file;
+use clift_model::check_images;
 use embedded_graphics::mono_font::{MonoFont, MonoTextStyle};
 use embedded_graphics::pixelcolor::{Rgb888, RgbColor};
 use embedded_graphics::prelude::{DrawTarget, Drawable, OriginDimensions, Pixel, Point, Size};
@@ -10,7 +11,6 @@ use embedded_graphics::text::{Baseline, Text};
 use image::RgbImage;
 
 use crate::error::EvalError;
-use crate::metrics::image_metrics::check;
 
 /// Mean absolute error over red, green and blue at the brightest colour of [`error_map`].
 pub const ERROR_FULL_SCALE: f32 = 0.25;
@@ -142,7 +142,7 @@ impl DrawTarget for Canvas {
 /// Makes an image of the mean absolute error over red, green and blue, in the colours of [`error_colour`]. Refuses a
 /// NaN or an infinity, which would look like no error.
 pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Canvas, EvalError> {
-    check(pred, target, height * width * 3)?;
+    check_images(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred
         .as_chunks::<3>()
         .0

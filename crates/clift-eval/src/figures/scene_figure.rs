@@ -9,8 +9,8 @@ use crate::error::EvalError;
 use crate::figures::canvas::{Canvas, error_map};
 use crate::figures::contact_sheet::{Cell, Row, contact_sheet};
 use crate::statistics::view_metrics::{EvalKey, best_method};
-use crate::sweep::baselines::view_image;
 use crate::sweep::rendered_views::{SceneResults, ScoredViews};
+use clift_scene::view_image;
 
 /// Longer side of an image in the report, which holds dozens of images.
 const MAX_SIDE_PX: usize = 128;

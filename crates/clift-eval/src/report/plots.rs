@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 
 use crate::config::method::Method;
 use crate::report::axis::{Scale, milliseconds};

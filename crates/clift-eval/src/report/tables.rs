@@ -1,7 +1,7 @@
 //! The tables of the page.
 
 use clift_data::SkipReport;
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use maud::{Markup, html};
 
 use crate::report::axis::{grouped, milliseconds};

@@ -69,7 +69,7 @@ fn decibels(psnr: Option<f64>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenCoding;
+    use clift_scene::TokenCoding;
 
     use super::*;
     use crate::statistics::eval_results::EvalResults;

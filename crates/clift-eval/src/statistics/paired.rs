@@ -1,6 +1,6 @@
 //! Paired differences of the methods of an evaluation.
 
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;

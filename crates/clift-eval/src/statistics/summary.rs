@@ -284,7 +284,7 @@ fn mark_fronts(points: &mut [SummaryPoint]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clift_model::TokenCoding;
+    use clift_scene::TokenCoding;
 
     use crate::testing::CLIFT;
 

@@ -109,7 +109,7 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenCoding;
+    use clift_scene::TokenCoding;
 
     use crate::config::method::{Method, MethodName};
     use crate::statistics::eval_results::EvalResults;

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use clift_core::mean;
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;

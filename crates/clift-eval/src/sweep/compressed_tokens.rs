@@ -1,15 +1,14 @@
 //! The stored tokens of a scene, by method, and the model that renders them.
 // N encoder tokens, S stored tokens, R rendered tokens, D width
 
-use burn::tensor::{Tensor, TensorData};
 use clift_core::{Pose, PoseNormalization, item_rng};
 use clift_data::Clip;
-use clift_model::{Scene, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes};
+use clift_model::{Tokens, TrainedModel};
+use clift_scene::{Scene, TokenCodec, TokenCoding, TokenFormat, scene_file_bytes};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
 use crate::config::method::Method;
-use crate::encode::host_values;
 use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
@@ -58,9 +57,9 @@ impl<'a> CompressedTokens<'a> {
                     models.codec.as_ref().ok_or_else(|| EvalError::NoModel { method: "coded tokens".into() })?;
                 let share = num_tokens as f64 / lift.dims()[1] as f64;
                 let step = codec.rates.step_for_loss(share, loss.db()) as f32;
-                let scene = scene_of(clip, codec, &ids, host_values(&tokens)?, model_path);
+                let scene = scene_of(clip, codec, &ids, tokens.to_host()?, model_path);
                 let bytes = scene.coded_bytes(codec, step)?.len() as u64;
-                (with_values(tokens, scene.rounded_tokens(codec, step)?), bytes)
+                (tokens.with_host_values(scene.rounded_tokens(codec, step)?), bytes)
             }
         };
         Ok(Self { tokens, ids, model, file_bytes: Some(bytes) })
@@ -92,14 +91,8 @@ fn rounded(tokens: Tokens, format: TokenFormat) -> Result<Tokens, EvalError> {
     if format == TokenFormat::F32 {
         return Ok(tokens);
     }
-    let values = format.round(&host_values(&tokens)?, tokens.dims()[2])?;
-    Ok(with_values(tokens, values))
-}
-
-/// Returns tokens of other values.
-pub(crate) fn with_values(tokens: Tokens, values: Vec<f32>) -> Tokens {
-    let (shape, device) = (tokens.dims(), tokens.values.device());
-    tokens.with_values(Tensor::from_data(TensorData::new(values, shape), &device))
+    let values = format.round(&tokens.to_host()?, tokens.dims()[2])?;
+    Ok(tokens.with_host_values(values))
 }
 
 /// Returns the scene of stored tokens. Its normalization is that of no capture, which does not change the size of a file.

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use clift_model::{Grouping, TokenCodec, TrainedModel};
+use clift_model::{Grouping, TrainedModel};
+use clift_scene::TokenCodec;
 
 use crate::config::method::Method;
 

@@ -6,7 +6,8 @@ use std::time::Instant;
 
 use clift_core::{derive_seed, median};
 use clift_data::Clip;
-use clift_model::{Cameras, FlopConvention, Grouping, TokenCoding, Tokens, TrainedModel, Views};
+use clift_model::{Cameras, FlopConvention, Grouping, Tokens, TrainedModel, Views};
+use clift_scene::TokenCoding;
 
 use crate::config::method::Method;
 use crate::error::EvalError;

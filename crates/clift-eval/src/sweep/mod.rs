@@ -5,18 +5,14 @@
 //! - `lazy_clusters`: K-means or tiles, computed once
 //! - `compressed_tokens`: stored tokens of a method
 //! - `token_choice`: tokens selected for each view
-//! - `baselines`: nearest view and mean image
 //! - `view_scorer`: score renderings of a scene
 //! - `rendered_views`: scored views of one `EvalKey`, results of one scene
 //! - `predictions`: images of another method, scored
-//! - `held_out_frame`: a check of an encoded scene
 //! - `evaluate_scene`: encode once, render every key
 
-pub(crate) mod baselines;
 pub(crate) mod compressed_tokens;
 pub(crate) mod eval_models;
 pub(crate) mod evaluate_scene;
-pub(crate) mod held_out_frame;
 pub(crate) mod lazy_clusters;
 pub(crate) mod predictions;
 pub(crate) mod rendered_views;

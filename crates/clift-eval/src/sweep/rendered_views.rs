@@ -8,9 +8,9 @@ use clift_model::SceneClusters;
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
-use crate::sweep::baselines::{mean_image, nearest_image};
 use crate::sweep::token_choice::SelectedTokens;
 use crate::sweep::view_scorer::ViewScorer;
+use clift_scene::{mean_image, nearest_image};
 
 /// The scored target views of a scene under one key.
 pub(crate) struct ScoredViews {

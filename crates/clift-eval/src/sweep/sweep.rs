@@ -1,9 +1,8 @@
 //! Settings of a sweep over methods and token counts.
 
-use clift_model::{KMeans, ModelConfig};
+use clift_model::{KMeans, Lpips, ModelConfig};
 
 use crate::config::eval_config::EvalConfig;
-use crate::metrics::lpips::Lpips;
 use crate::sweep::predictions::ExternalMethod;
 
 /// Settings of a sweep.

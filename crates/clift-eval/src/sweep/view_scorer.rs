@@ -4,12 +4,11 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use clift_core::ClipViews;
+use clift_model::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures, SSIM_MIN_SIZE_PX, psnr, ssim};
 
 use crate::error::EvalError;
-use crate::metrics::image_metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
-use crate::metrics::lpips::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
 use crate::statistics::view_metrics::ViewMetrics;
-use crate::sweep::baselines::view_image;
+use clift_scene::view_image;
 
 /// Memory for the LPIPS features of the target views, which every key is compared with: 31 images of 256 x 256. The
 /// features of further targets are computed every time.
@@ -43,7 +42,7 @@ impl<'a> ViewScorer<'a> {
         let (height, width) = (self.target.height, self.target.width);
         let features = lpips.features(pixels, height, width)?;
         if let Some(target) = self.cache.borrow().1.get(&view) {
-            return lpips.distance(&features, target);
+            return Ok(lpips.distance(&features, target)?);
         }
         let target = lpips.features(target, height, width)?;
         let distance = lpips.distance(&features, &target)?;

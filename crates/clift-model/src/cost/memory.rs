@@ -252,12 +252,7 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
 
 /// Returns the peak bytes of tensors, without weights, while `num_views` views of `num_patches` patches in total are rendered
 /// from `num_render_tokens` tokens.
-pub(crate) fn render_bytes(
-    config: &ModelConfig,
-    num_render_tokens: usize,
-    num_views: usize,
-    num_patches: usize,
-) -> u64 {
+pub fn render_bytes(config: &ModelConfig, num_render_tokens: usize, num_views: usize, num_patches: usize) -> u64 {
     let values = |rows: usize| (rows * config.dim) as f64;
     let image = (num_patches * config.rgb_patch_len()) as f64;
     // Rays of the pixels (twice the image), patches, image, and its copy on the host.

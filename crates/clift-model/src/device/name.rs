@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
-use crate::names::{names, parse};
+use crate::names::{names, parse_variant};
 
 /// A device, by its name in configs and on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
@@ -101,7 +101,7 @@ impl std::str::FromStr for DeviceName {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        parse(name).ok_or_else(|| ModelError::NoDevice {
+        parse_variant(name).ok_or_else(|| ModelError::NoDevice {
             name: name.into(),
             reason: format!("unknown; use one of {}", names::<Self>()),
         })

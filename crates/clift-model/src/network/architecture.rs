@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
-use crate::names::{names, parse};
+use crate::names::{names, parse_variant};
 
 /// Kind of the network.
 #[derive(
@@ -106,6 +106,6 @@ impl std::str::FromStr for CliftVariant {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        parse(text).ok_or_else(|| format!("write {}", names::<Self>()))
+        parse_variant(text).ok_or_else(|| format!("write {}", names::<Self>()))
     }
 }

@@ -94,7 +94,7 @@ impl ModelConfig {
     }
 
     /// Returns the number of tokens of a scene that are learned and belong to no view; `None` for a token per patch.
-    pub(crate) fn num_learned_tokens(&self) -> Option<usize> {
+    pub fn num_learned_tokens(&self) -> Option<usize> {
         self.design().num_learned_tokens(self)
     }
 

@@ -1,9 +1,12 @@
 //! Tokens with the transforms of camera-relative attention.
 
-use burn::tensor::{Int, Tensor};
+use burn::tensor::{Int, Tensor, TensorData};
 
-use crate::network::camera_encoding::{TokenTransforms, upload_ids};
+use crate::error::ModelError;
+use crate::network::camera_encoding::{TokenTransforms, TransformMaker, upload_ids};
+use crate::network::config::ModelConfig;
 use crate::tokens::clusters::ClusterIndex;
+use crate::views::upload::Cameras;
 
 /// Tokens of scenes. Through clustering, storage and selection they keep the camera and the patch that they come from.
 #[derive(Clone, Debug)]
@@ -23,6 +26,16 @@ impl Tokens {
         Self { values, transforms: None }
     }
 
+    /// Takes stored tokens, one of every patch of the context views in `ids`.
+    ///
+    /// # Shapes
+    /// - `values`: `[batch, num_tokens, dim]`
+    /// - `context`: `[batch, views]`
+    pub fn of_patches(config: &ModelConfig, values: Tensor<3>, context: &Cameras, ids: &[u32]) -> Self {
+        let transforms = TransformMaker::new(config).of_views(context);
+        Self { values, transforms: transforms.map(|transforms| transforms.select(ids)) }
+    }
+
     /// Returns `[batch, num_tokens, dim]`.
     pub fn dims(&self) -> [usize; 3] {
         self.values.dims()
@@ -32,6 +45,20 @@ impl Tokens {
     #[must_use]
     pub fn with_values(&self, values: Tensor<3>) -> Self {
         Self { transforms: self.transforms.as_ref().map(|transforms| transforms.tracked_as(&values)), values }
+    }
+
+    /// Returns the values on the host, row-major.
+    ///
+    /// # Errors
+    /// [`ModelError::Device`].
+    pub fn to_host(&self) -> Result<Vec<f32>, ModelError> {
+        self.values.clone().into_data().convert::<f32>().try_to_vec().map_err(ModelError::device)
+    }
+
+    /// Returns other values of the same tokens, from the host, row-major.
+    #[must_use]
+    pub fn with_host_values(&self, values: Vec<f32>) -> Self {
+        self.with_values(Tensor::from_data(TensorData::new(values, self.dims()), &self.values.device()))
     }
 
     /// Selects the same tokens of every scene, given by their indices.

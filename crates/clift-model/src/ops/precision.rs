@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
-use crate::names::{names, parse};
+use crate::names::{names, parse_variant};
 
 /// Type of the operands of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
@@ -100,7 +100,7 @@ impl std::str::FromStr for Precision {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        parse(name).ok_or_else(|| format!("use one of {}", names::<Self>()))
+        parse_variant(name).ok_or_else(|| format!("use one of {}", names::<Self>()))
     }
 }
 

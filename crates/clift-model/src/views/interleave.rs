@@ -10,7 +10,7 @@ use crate::views::upload::Cameras;
 
 /// Returns the number of images along either axis that an image of `size` is interleaved from, and their size; sizes are
 /// `[height, width]`.
-pub(crate) fn parts(trained_height: usize, patch_size: usize, size: [usize; 2]) -> (usize, [usize; 2]) {
+pub fn phases(trained_height: usize, patch_size: usize, size: [usize; 2]) -> (usize, [usize; 2]) {
     let k = ((size[0] as f64 / trained_height as f64).round() as usize).max(1);
     if k == 1 { (k, size) } else { (k, size.map(|side| side.div_ceil(k).next_multiple_of(patch_size))) }
 }
@@ -20,13 +20,13 @@ pub(crate) fn parts(trained_height: usize, patch_size: usize, size: [usize; 2]) 
 /// # Shapes
 /// - `draw`: of cameras of any size, `[batch, views, height, width, 3]`
 /// - returns `[batch, views, height, width, 3]` of the size of `targets`
-pub(crate) fn interleaved(
+pub fn interleaved(
     trained_height: usize,
     patch_size: usize,
     targets: &Cameras,
     draw: impl Fn(&Cameras) -> Tensor<5>,
 ) -> Tensor<5> {
-    let (k, [height, width]) = parts(trained_height, patch_size, [targets.height, targets.width]);
+    let (k, [height, width]) = phases(trained_height, patch_size, [targets.height, targets.width]);
     if k == 1 {
         return draw(targets);
     }

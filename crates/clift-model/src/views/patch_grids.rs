@@ -64,7 +64,7 @@ impl PatchGrids {
     }
 
     /// Returns the number of patches of every grid of an image, `[rows, columns]`: a shifted grid has one more of both.
-    pub(crate) fn patches(self, patch_size: usize, patches: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
+    pub fn patches(self, patch_size: usize, patches: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
         let grown = move |shift: usize| patches.map(|side| side + usize::from(shift > 0));
         self.shifts(patch_size).into_iter().map(grown)
     }

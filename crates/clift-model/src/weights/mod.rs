@@ -1,7 +1,6 @@
 //! Weight files, published names, and trained models.
 //!
-//! `file` reads and writes safetensors in PyTorch's layout, `tensors` single tensors of other files; `hash` identifies a set
-//! of weights; `model_path` finds the weights and config of a run, and `trained_model` opens them. `published_keys` maps
+//! `file` reads and writes safetensors in PyTorch's layout; `hash` identifies a set of weights; `model_path` finds the weights and config of a run, and `trained_model` opens them. `published_keys` maps
 //! parameter names to those of published checkpoints, and `published_sizes` infers the sizes of a network from the shapes in
 //! a checkpoint.
 
@@ -10,5 +9,4 @@ pub(crate) mod hash;
 pub(crate) mod model_path;
 pub(crate) mod published_keys;
 pub(crate) mod published_sizes;
-pub(crate) mod tensors;
 pub(crate) mod trained_model;

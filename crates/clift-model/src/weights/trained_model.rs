@@ -71,11 +71,14 @@ impl TrainedModel {
     }
 }
 
+/// Reads the renderer of a network from a weight file, whose sizes may come from a hostile scene file.
+///
+/// # Errors
+/// [`ModelError::Weights`] for a file that cannot be read, is too small or lacks parameters of the renderer.
 pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let refuse = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     let size = std::fs::metadata(path).map_err(|error| refuse(error.to_string()))?.len();
-    // The sizes may come from a hostile scene file: no more memory is allocated than the weight file, which may be in f16,
-    // can fill.
+    // No more memory is allocated than the weight file, which may be in f16, can fill.
     let needed = 2 * Parameters::of(config).renderer;
     if needed > size {
         return Err(refuse(format!("the scene's renderer needs at least {needed} bytes, the file has {size}")));

@@ -2,8 +2,7 @@
 
 use clift_core::{BadConfig, check_config};
 use clift_data::{DataConfig, SourceKind, Split};
-use clift_eval::PERCEPTUAL_MIN_SIZE_PX;
-use clift_model::Grouping;
+use clift_model::{Grouping, PERCEPTUAL_MIN_SIZE_PX};
 
 use crate::config::config::{CheckpointConfig, Config, MAX_TOKENS, OptimizerConfig};
 use crate::error::{TrainError, bad};

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clift_core::{BadConfig, check_config, derive_seed};
 use clift_data::DataConfig;
-use clift_eval::{EvalConfig, PERCEPTUAL_COMMAND, Sweep};
-use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCount};
+use clift_eval::{EvalConfig, Sweep};
+use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, PERCEPTUAL_COMMAND, Precision, TokenCount};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{TrainError, bad};

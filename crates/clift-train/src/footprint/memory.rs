@@ -1,7 +1,6 @@
 //! Peak memory of every part of a run, and a warning where the device has less.
 
-use clift_eval::VggShape;
-use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, inference_bytes, update_bytes};
+use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, VggShape, inference_bytes, update_bytes};
 
 use crate::config::config::Config;
 use crate::error::TrainError;

@@ -1,7 +1,7 @@
 //! Sizes of the steps of a run: all possible ones, the largest.
 
-use clift_eval::{EvalConfig, LPIPS_MIN_SIZE_PX, Method};
-use clift_model::SceneSizes;
+use clift_eval::{EvalConfig, Method};
+use clift_model::{LPIPS_MIN_SIZE_PX, SceneSizes};
 
 use crate::config::config::Config;
 use crate::error::TrainError;

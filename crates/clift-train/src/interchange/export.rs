@@ -7,9 +7,10 @@ use burn::store::PathFilter;
 use clift_core::replace_file;
 use clift_data::write_state_dict;
 use clift_model::{
-    CameraEncoding, Clift, DeviceName, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TokenCodec, TrainedModel,
-    published_tensors, save_part_f16,
+    CameraEncoding, Clift, DeviceName, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TrainedModel, published_tensors,
+    save_part_f16,
 };
+use clift_scene::TokenCodec;
 use half::f16;
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;

@@ -6,7 +6,8 @@ use std::sync::atomic::AtomicBool;
 
 use clift_core::{PoseRotation, PoseScale, TEMPORARY, folder_of, publish_folder, replace_file};
 use clift_data::SourceKind;
-use clift_model::{CliftVariant, ModelConfig, ModelPath, TokenCodec, TrainedModel, sorted_header};
+use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
+use clift_scene::TokenCodec;
 use safetensors::tensor::{Dtype, TensorView};
 
 use crate::config::config::Config;

@@ -6,7 +6,8 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::Device;
 use clift_data::{ClipReader, open_dataset};
 use clift_eval::{EvalFrames, EvalModels, Method, Summary};
-use clift_model::{ModelConfig, ModelError, ModelPath, TokenCodec, TrainedModel};
+use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
+use clift_scene::TokenCodec;
 
 use crate::config::config::Config;
 use crate::distributed::ranks::Ranks;

@@ -5,7 +5,7 @@
 //! had the new number from the start, and `run.json` records the extension. Steps with images of half the size after steps with
 //! whole ones are refused.
 
-use clift_model::TokenCodec;
+use clift_scene::TokenCodec;
 use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::checkpoints::Checkpoints;

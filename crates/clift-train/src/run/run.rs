@@ -10,10 +10,11 @@ use burn::tensor::Device;
 use clift_data::{
     ClipReader, OpenedSource, SceneSource, SceneSubset, SourceKind, Split, open_dataset, open_training_dataset,
 };
-use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
+use clift_eval::{EvalFrames, EvalModels, EvalSplit, Summary, write_skip_report};
 use clift_model::{
-    Clift, ModelPath, TokenCodec, TrainedModel, check_sizes, load_part, save_part, save_weights, weights_hash,
+    Clift, LPIPS_COMMAND, ModelPath, TrainedModel, check_sizes, load_part, save_part, save_weights, weights_hash,
 };
+use clift_scene::TokenCodec;
 
 use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;

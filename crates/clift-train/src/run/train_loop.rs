@@ -6,8 +6,8 @@ use std::time::Instant;
 use burn::module::Module;
 use clift_core::make_folder;
 use clift_data::plural;
-use clift_eval::{peak_bytes, psnr_of_mse};
-use clift_model::{Clift, weights_hash};
+use clift_eval::peak_bytes;
+use clift_model::{Clift, psnr_of_mse, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, TrainingPosition};

@@ -11,7 +11,8 @@ use clift_eval::{
     EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, RunDescription, SceneFigures,
     SceneLimits, Summary, Sweep,
 };
-use clift_model::{Clift, TokenCoding, TokenCount, TrainedModel};
+use clift_model::{Clift, TokenCount, TrainedModel};
+use clift_scene::TokenCoding;
 
 use crate::config::config::Config;
 use crate::distributed::ranks::Ranks;

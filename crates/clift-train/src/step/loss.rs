@@ -4,8 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
-use clift_eval::Perceptual;
-use clift_model::{Pass, PassState};
+use clift_model::{Pass, PassState, Perceptual};
 
 use crate::config::config::LossConfig;
 use crate::error::TrainError;

@@ -3,7 +3,8 @@
 use burn::tensor::Device;
 use clift_core::{Camera, Intrinsics, IntrinsicsNorm, RgbImage, focus_distance, mean_intrinsics};
 use clift_eval::{Canvas, available_bytes};
-use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, frame_bytes};
+use clift_model::{DeviceName, Renderer, SelectionPreset};
+use clift_scene::{Scene, SceneRenderer, TokenCoding, frame_bytes};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};

@@ -2,8 +2,9 @@
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem};
-use clift_eval::{EncodeOptions, EncodedScene, encode, file_name};
-use clift_model::{DeviceName, Renderer, Scene, TokenCoding, TokenCount, TokenFormat, TrainedModel};
+use clift_eval::file_name;
+use clift_model::{DeviceName, Renderer, TokenCount, TrainedModel};
+use clift_scene::{EncodeOptions, EncodedScene, Scene, TokenCoding, TokenFormat, encode};
 
 use crate::error::ViewError;
 use crate::protocol::request::OpenRequest;
@@ -28,7 +29,7 @@ pub struct SceneFile {
     pub coding: TokenCoding,
     /// Bytes of the file.
     pub file_bytes: u64,
-    /// The renderer, from [`load_renderer`](clift_model::load_renderer).
+    /// The renderer, from [`load_renderer`](clift_scene::load_renderer).
     pub renderer: Renderer,
     /// Words after `clift render` that name the file, its model and its device.
     pub render_args: Vec<String>,
@@ -119,7 +120,7 @@ impl RunScenes {
         let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
         let options = EncodeOptions {
             context: Some(views.context.clone()),
-            stored_tokens: TokenCount::Count(stored),
+            stored_tokens: Some(TokenCount::Count(stored)),
             ..self.options.clone()
         };
         let EncodedScene { mut scene, clusters, .. } = encode(&self.model, &self.reader, *index, &options)?;

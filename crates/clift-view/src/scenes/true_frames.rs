@@ -3,7 +3,7 @@
 use clift_core::{Camera, ClipViews, Pose};
 use clift_data::{ClipReader, ViewIndices};
 use clift_eval::Canvas;
-use clift_model::Scene;
+use clift_scene::Scene;
 
 use crate::error::ViewError;
 

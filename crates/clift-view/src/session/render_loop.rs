@@ -7,8 +7,9 @@ use std::time::Instant;
 use burn::tensor::Device;
 use clift_core::RgbImage;
 use clift_data::{encode_jpeg, encode_png};
-use clift_eval::{Canvas, psnr};
-use clift_model::{DeviceName, PatchGrids, SceneRenderer, SelectionPreset};
+use clift_eval::Canvas;
+use clift_model::{DeviceName, PatchGrids, SelectionPreset, psnr};
+use clift_scene::SceneRenderer;
 
 use crate::error::ViewError;
 use crate::protocol::reply::{Comparison, Frame, Reply};

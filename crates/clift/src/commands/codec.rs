@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::{ClipReader, Split};
-use clift_eval::{EvalFrames, EvalSplit, FittedCodec, table};
-use clift_model::TokenCodec;
+use clift_eval::{EvalFrames, EvalSplit, table};
+use clift_scene::{FittedCodec, TokenCodec};
 use clift_train::fit_token_codec;
 
 use crate::commands::args::model_args::ModelArgs;

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clift_data::{SourceKind, Split};
 use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
-use clift_model::{ModelPath, TokenCoding, TokenCount};
+use clift_model::{ModelPath, TokenCount};
+use clift_scene::TokenCoding;
 use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
 
 use crate::commands::args::model_args::check_network;

@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use clift_data::{ClipReader, EvaluationItem, SkipReport, Split, ViewIndices};
-use clift_eval::{EncodeOptions, EvalFrames, evaluation_items, spread_contexts};
-use clift_model::{DeviceName, ModelConfig, Scene, load_renderer};
+use clift_eval::{EvalFrames, evaluation_items};
+use clift_model::{DeviceName, ModelConfig};
+use clift_scene::{EncodeOptions, Scene, load_renderer, spread_contexts};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
 use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
@@ -121,7 +122,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let options = EncodeOptions {
         context: None,
         num_context: config.eval.num_context,
-        stored_tokens: config.eval.validation_stored_tokens,
+        stored_tokens: Some(config.eval.validation_stored_tokens),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,

@@ -2,7 +2,8 @@
 
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
-use clift_model::{Cameras, ModelError, TokenFormat, Views};
+use clift_model::{Cameras, ModelError, Views};
+use clift_scene::TokenFormat;
 use clift_train::{TrainError, seeded_clip, seeded_model};
 
 use crate::cases::reference::{ToF64, largest_magnitude, module_in_f64, values};

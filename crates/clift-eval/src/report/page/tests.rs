@@ -1,4 +1,5 @@
-use clift_model::{SceneClusters, TokenCoding};
+use clift_model::SceneClusters;
+use clift_scene::TokenCoding;
 
 use super::*;
 use crate::config::method::{Method, MethodName};

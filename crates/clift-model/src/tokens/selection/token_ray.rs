@@ -30,7 +30,7 @@ impl TokenRay {
     }
 
     /// Returns `[moment, direction]`.
-    pub(crate) fn plucker(&self) -> [f64; 6] {
+    pub fn plucker(&self) -> [f64; 6] {
         let ([a, b, c], [x, y, z]) = (self.origin.cross(self.direction).to_array(), self.direction.to_array());
         [a, b, c, x, y, z]
     }

@@ -6,7 +6,8 @@ use clift_data::{
     DataError, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
     open_source,
 };
-use clift_model::{CameraEncoding, ModelConfig, ModelError, ModelPath, TrainedModel};
+use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
+use clift_scene::default_num_context;
 use clift_train::{Config, Override};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
@@ -84,18 +85,17 @@ impl ModelArgs {
         Ok(opened)
     }
 
-    /// Returns the default number of context views of a scene: as many as in training. Of a scene of the folder, a network
-    /// with camera-relative attention takes one for every fourth frame, up to three times as many as in training: further
-    /// views improve its renderings (models/rooms/README.md).
+    /// Returns the default number of context views of a scene: as many as in training, or [`default_num_context`] of a scene
+    /// of the folder.
     ///
     /// # Errors
     /// Those of counting the frames.
     pub fn num_context(&self, source: &dyn SceneSource, scene: usize) -> Result<usize, DataError> {
         let trained = self.config.data.views.max_context;
-        if self.folder.is_none() || self.config.model.camera_encoding == CameraEncoding::Plucker {
+        if self.folder.is_none() {
             return Ok(trained);
         }
-        Ok((source.num_frames(scene)? / 4).clamp(trained, 3 * trained))
+        default_num_context(&self.config.model, trained, source, scene)
     }
 
     /// Reads the weights.

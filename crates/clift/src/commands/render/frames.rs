@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::Context;
 use clift_core::{Camera, is_empty_folder, median};
 use clift_eval::{Animation, Canvas, Video};
-use clift_model::SceneRenderer;
+use clift_scene::SceneRenderer;
 use clift_train::TrainError;
 use serde::Serialize;
 

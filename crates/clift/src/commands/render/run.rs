@@ -7,10 +7,8 @@ use anyhow::Context;
 use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_path};
 use clift_data::read_poses;
 use clift_eval::available_bytes;
-use clift_model::{
-    DeviceName, MAX_SIDE_PX, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, RenderBudget, Scene,
-    SceneRenderer, frame_bytes, frames_per_call, load_renderer,
-};
+use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision};
+use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};

@@ -1,0 +1,179 @@
+//! PSNR and SSIM of one image, in f64.
+//!
+//! Images are row-major `[height, width, 3]` slices with values in [0, 1].
+
+use crate::error::ModelError;
+
+/// Smallest height and width that hold one SSIM window.
+pub const SSIM_MIN_SIZE_PX: usize = 2 * SSIM_RADIUS + 1;
+
+const SSIM_RADIUS: usize = 5;
+const SSIM_SIGMA_PX: f64 = 1.5;
+const SSIM_C1: f64 = 0.01 * 0.01;
+const SSIM_C2: f64 = 0.03 * 0.03;
+/// scikit-image's `use_sample_covariance`: n / (n - 1) with n = 11 x 11.
+const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
+
+/// Measures the peak signal-to-noise ratio in dB, after clamping both images to [0, 1].
+///
+/// The mean squared error is over all values. Identical images give `+inf`, which counts as 100 dB in means.
+///
+/// # Errors
+/// [`ModelError::BadImage`], also where clamping would hide a NaN or an infinity.
+pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, ModelError> {
+    check_images(pred, target, target.len())?;
+    let squared_error: f64 = pred
+        .iter()
+        .zip(target)
+        .map(|(p, t)| (f64::from(p.clamp(0.0, 1.0)) - f64::from(t.clamp(0.0, 1.0))).powi(2))
+        .sum();
+    Ok(psnr_of_mse(squared_error / target.len() as f64))
+}
+
+/// Returns the PSNR in dB of a mean squared error of values in `[0, 1]`.
+pub fn psnr_of_mse(mse: f64) -> f64 {
+    0.0 - 10.0 * mse.log10() // 0, not -0, of a mean squared error of 1
+}
+
+/// Measures the structural similarity of two `[height, width, 3]` images; 1 for identical images.
+///
+/// Equals scikit-image's `structural_similarity(win_size=11, gaussian_weights=True, data_range=1)`: Gaussian window of
+/// sigma 1.5 and 11 taps, sample covariance, only windows inside the image, mean over positions and then channels. The
+/// images are not clamped.
+///
+/// # Errors
+/// [`ModelError::BadImage`], also below 11 x 11 pixels.
+pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, ModelError> {
+    check_images(pred, target, height * width * 3)?;
+    check_size("SSIM", SSIM_MIN_SIZE_PX, height, width)?;
+    // Single-threaded (13 ms for 256 x 256): callers have many images to distribute over cores.
+    let per_channel = [0, 1, 2].map(|channel| {
+        let plane = |image: &[f32]| image.iter().skip(channel).step_by(3).map(|&v| f64::from(v)).collect();
+        ssim_of_planes(plane(pred), plane(target), width)
+    });
+    Ok(per_channel.iter().sum::<f64>() / 3.0)
+}
+
+fn ssim_of_planes(pred: Vec<f64>, target: Vec<f64>, width: usize) -> f64 {
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
+    let taps = gaussian_taps();
+    let squared_pred = blur(&product(&pred, &pred), width, &taps);
+    let squared_target = blur(&product(&target, &target), width, &taps);
+    let cross = blur(&product(&pred, &target), width, &taps);
+    let (mean_pred, mean_target) = (blur(&pred, width, &taps), blur(&target, width, &taps));
+    let mut sum = 0.0;
+    for (i, (&p, &t)) in mean_pred.iter().zip(&mean_target).enumerate() {
+        let variance_pred = SAMPLE_COVARIANCE * (squared_pred[i] - p * p);
+        let variance_target = SAMPLE_COVARIANCE * (squared_target[i] - t * t);
+        let covariance = SAMPLE_COVARIANCE * (cross[i] - p * t);
+        let luminance = (2.0 * p * t + SSIM_C1) / (p * p + t * t + SSIM_C1);
+        sum += luminance * (2.0 * covariance + SSIM_C2) / (variance_pred + variance_target + SSIM_C2);
+    }
+    sum / mean_pred.len() as f64
+}
+
+fn gaussian_taps() -> [f64; SSIM_MIN_SIZE_PX] {
+    let mut taps = [0.0; SSIM_MIN_SIZE_PX];
+    for (i, tap) in taps.iter_mut().enumerate() {
+        let distance_px = i as f64 - SSIM_RADIUS as f64;
+        *tap = (-0.5 * (distance_px / SSIM_SIGMA_PX).powi(2)).exp();
+    }
+    let sum: f64 = taps.iter().sum();
+    taps.map(|tap| tap / sum)
+}
+
+/// Filters with `taps` along both axes, at the positions whose window lies inside the plane.
+fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64> {
+    let height = plane.len() / width;
+    let mut blurred = Vec::with_capacity(plane.len());
+    let mut row = vec![0.0; width];
+    for y in 0..=height - taps.len() {
+        row.fill(0.0);
+        for (tap, above) in taps.iter().zip(plane[y * width..].chunks_exact(width)) {
+            for (sum, value) in row.iter_mut().zip(above) {
+                *sum += tap * value;
+            }
+        }
+        blurred.extend(row.windows(taps.len()).map(|w| w.iter().zip(taps).map(|(v, tap)| v * tap).sum::<f64>()));
+    }
+    blurred
+}
+
+/// Refuses images of another size than `expected` values, NaN and infinity.
+///
+/// # Errors
+/// [`ModelError::BadImage`].
+pub fn check_images(pred: &[f32], target: &[f32], expected: usize) -> Result<(), ModelError> {
+    for (image, name) in [(target, "target"), (pred, "prediction")] {
+        if image.len() != expected || image.is_empty() {
+            let reason = format!("image sizes differ: expected {expected} values, got {}", image.len());
+            return Err(ModelError::BadImage { reason });
+        }
+        if let Some(index) = image.iter().position(|value| !value.is_finite()) {
+            let reason = format!("the {name} is not finite: value {} at index {index}", image[index]);
+            return Err(ModelError::BadImage { reason });
+        }
+    }
+    Ok(())
+}
+
+pub fn check_size(metric: &str, min: usize, height: usize, width: usize) -> Result<(), ModelError> {
+    if height.min(width) >= min {
+        return Ok(());
+    }
+    let reason = format!("{metric} needs at least {min} x {min} pixels, got {width} x {height}");
+    Err(ModelError::BadImage { reason })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Fixture;
+
+    #[test]
+    fn psnr_and_ssim_equal_torch_and_scikit_image() {
+        let fixture = Fixture::open("metrics");
+        let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
+        let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
+        let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));
+        let size = height * width * 3;
+        for i in 0..count {
+            let (pred, target) = (&pred[i * size..][..size], &target[i * size..][..size]);
+            let (psnr, ssim) = (psnr(pred, target).unwrap(), ssim(pred, target, height, width).unwrap());
+            // Both sides clamp and sum in f64, in different orders: an error of 1e-13.
+            assert!(psnr == expected_psnr[i] || (psnr - expected_psnr[i]).abs() < 1e-9, "pair {i}: {psnr} dB");
+            // The variances are differences of numbers near 1, divided by at least C2 = 9e-4: 1e-16 / 9e-4 = 1e-13 per
+            // pixel. 1e-10 has room and still detects f32 filters (1e-6).
+            assert!((ssim - expected_ssim[i]).abs() < 1e-10, "pair {i}: {ssim} is not {}", expected_ssim[i]);
+        }
+    }
+
+    #[test]
+    fn psnr_clamps_and_is_exact() {
+        // 0.75 - 0.25 is exact in f32, so the mean squared error is exactly 1/4.
+        assert_eq!(psnr(&[0.75; 12], &[0.25; 12]).unwrap(), -10.0 * 0.25_f64.log10());
+        assert_eq!(psnr(&[0.0; 12], &[1.0; 12]).unwrap().to_string(), "0");
+        assert_eq!(psnr(&[1.5, -0.25, 1.0], &[1.0, 0.0, 1.0]).unwrap(), f64::INFINITY);
+    }
+
+    #[test]
+    fn bad_images_are_errors() {
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let mut pred = vec![0.5; 11 * 11 * 3];
+            pred[7] = value;
+            let target = vec![0.5; 11 * 11 * 3];
+            for result in [psnr(&pred, &target), ssim(&pred, &target, 11, 11)] {
+                let expected = format!("the prediction is not finite: value {value} at index 7");
+                assert_eq!(result.unwrap_err().to_string(), expected);
+            }
+        }
+        let image = vec![0.5; 11 * 11 * 3];
+        assert!((ssim(&image, &image, 11, 11).unwrap() - 1.0).abs() < 1e-15);
+        let message = ssim(&image[..10 * 11 * 3], &image[..10 * 11 * 3], 10, 11).unwrap_err().to_string();
+        assert_eq!(message, "SSIM needs at least 11 x 11 pixels, got 11 x 10");
+        let message = psnr(&[0.5; 9], &[0.5; 12]).unwrap_err().to_string();
+        assert_eq!(message, "image sizes differ: expected 12 values, got 9");
+        assert!(psnr(&[], &[]).is_err());
+        assert!(ssim(&[0.5; 12], &[0.5; 12], 11, 11).is_err());
+    }
+}

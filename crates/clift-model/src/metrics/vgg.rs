@@ -1,0 +1,182 @@
+//! VGG features: 3 x 3 convolutions in five stages with pooling between the stages.
+// B images, C channels, H rows, W columns
+
+use burn::module::{Module, Param};
+use burn::nn::PaddingConfig2d;
+use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::tensor::activation::relu;
+use burn::tensor::module::{avg_pool2d, max_pool2d};
+use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
+use burn::tensor::{DType, Device, Tensor};
+
+use crate::error::ModelError;
+use crate::metrics::network_file::NetworkFile;
+
+/// Number of stages. Pooling halves the image between stages.
+pub const NUM_STAGES: usize = 5;
+
+/// Smallest side of an image for which every stage has a value.
+pub const MIN_SIZE_PX: usize = 1 << (NUM_STAGES - 1);
+
+/// Pooling over 2 x 2 values. An odd last row or column is dropped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pooling {
+    /// The maximum.
+    Max,
+    /// The mean.
+    Average,
+}
+
+/// Sizes of a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct VggShape {
+    /// Channels of each stage.
+    pub widths: [usize; NUM_STAGES],
+    /// Convolutions of each stage, without convolutions behind the last feature.
+    pub convs: [usize; NUM_STAGES],
+    /// Convolutions of each stage up to the feature, at least 1.
+    pub taps: [usize; NUM_STAGES],
+    /// Pooling between the stages.
+    pub pooling: Pooling,
+}
+
+impl VggShape {
+    /// VGG-16 with the features `relu1_2`, `relu2_2`, `relu3_3`, `relu4_3` and `relu5_3`.
+    pub const VGG16: Self =
+        Self { widths: [64, 128, 256, 512, 512], convs: [2, 2, 3, 3, 3], taps: [2, 2, 3, 3, 3], pooling: Pooling::Max };
+    /// VGG-19 with average pooling and the features `relu1_2`, `relu2_2`, `relu3_2`, `relu4_2` and `relu5_2`.
+    pub const VGG19: Self = Self {
+        widths: [64, 128, 256, 512, 512],
+        convs: [2, 2, 4, 4, 2],
+        taps: [2, 2, 2, 2, 2],
+        pooling: Pooling::Average,
+    };
+}
+
+/// Cost of a network for one image, in f32 values and multiply-accumulates.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VggSizes {
+    /// Parameters.
+    pub parameters: f64,
+    /// Multiply-accumulates of a forward pass.
+    pub macs: f64,
+    /// Output values of all convolutions and poolings.
+    pub outputs: f64,
+    /// Output values of the features.
+    pub features: f64,
+    /// Output values of the largest layer.
+    pub widest: f64,
+}
+
+impl VggShape {
+    /// Computes the cost of an image of `height` by `width` pixels.
+    pub fn sizes(&self, height: usize, width: usize) -> VggSizes {
+        let mut sizes = VggSizes { parameters: 0.0, macs: 0.0, outputs: 0.0, features: 0.0, widest: 0.0 };
+        let mut inputs = 3.0;
+        for (stage, (&count, &channels)) in self.convs.iter().zip(&self.widths).enumerate() {
+            let pixels = ((height >> stage) * (width >> stage)) as f64;
+            let values = channels as f64 * pixels;
+            if stage > 0 {
+                sizes.outputs += inputs * pixels;
+            }
+            for _ in 0..count {
+                sizes.parameters += 9.0 * inputs * channels as f64 + channels as f64;
+                sizes.macs += 9.0 * inputs * values;
+                sizes.outputs += values;
+                inputs = channels as f64;
+            }
+            sizes.features += values;
+            sizes.widest = sizes.widest.max(values);
+        }
+        sizes
+    }
+}
+
+/// A frozen network.
+#[derive(Module, Debug)]
+pub struct Vgg {
+    stages: Vec<Vec<Conv2d>>,
+    #[module(skip)]
+    shape: VggShape,
+}
+
+impl Vgg {
+    /// Makes a network with random weights.
+    pub fn random(shape: VggShape, device: &Device) -> Self {
+        let mut inputs = 3;
+        let mut conv = |outputs| {
+            let config = Conv2dConfig::new([inputs, outputs], [3, 3]);
+            inputs = outputs;
+            config.with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1)).init(device)
+        };
+        let stages = shape.convs.iter().zip(&shape.widths);
+        Self { stages: stages.map(|(&count, &outputs)| (0..count).map(|_| conv(outputs)).collect()).collect(), shape }
+    }
+
+    /// Takes the tensors `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias` out of a file.
+    pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, ModelError> {
+        let mut vgg = Self::random(shape, options.0);
+        for (stage, convs) in vgg.stages.iter_mut().enumerate() {
+            for (i, conv) in convs.iter_mut().enumerate() {
+                let name = format!("conv{}_{}", stage + 1, i + 1);
+                let dims = conv.weight.dims();
+                conv.weight = frozen(file.take(&format!("{name}.weight"), dims, options)?);
+                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [dims[0]], options)?));
+            }
+        }
+        Ok(vgg)
+    }
+
+    /// # Shapes
+    /// - `images`: `[batch, 3, height, width]`, both sides at least [`MIN_SIZE_PX`]
+    /// - returns `[batch, channels, height / 2^s, width / 2^s]` for the stages s = 0 to 4
+    pub fn features(&self, images: Tensor<4>) -> Vec<Tensor<4>> {
+        let mut x = images;
+        let mut features = Vec::new();
+        for (stage, convs) in self.stages.iter().enumerate() {
+            if stage > 0 {
+                x = self.shape.pooling.downsample(x); // [B, C, H, W] -> [B, C, H/2, W/2]
+            }
+            for (i, conv) in convs.iter().enumerate() {
+                x = relu(conv.forward(x));
+                if i + 1 == self.shape.taps[stage] {
+                    features.push(x.clone());
+                }
+            }
+        }
+        features
+    }
+}
+
+impl Pooling {
+    fn downsample(self, x: Tensor<4>) -> Tensor<4> {
+        match self {
+            Self::Max => max_pool2d(x, MaxPoolOptions::new([2, 2])),
+            Self::Average => avg_pool2d(x, AvgPoolOptions::new([2, 2])),
+        }
+    }
+}
+
+fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
+    Param::from_tensor(tensor).set_require_grad(false)
+}
+
+#[cfg(test)]
+pub mod tests {
+    use super::*;
+
+    /// Channels of the narrow networks in the fixtures.
+    pub const NARROW: [usize; NUM_STAGES] = [4, 6, 8, 8, 10];
+
+    #[test]
+    fn vgg16_has_its_published_size() {
+        // Convolutions of VGG-16 without the classifier: 14,714,688 weights and 15.35e9 multiplications at 224 pixels.
+        let sizes = VggShape::VGG16.sizes(224, 224);
+        assert_eq!(sizes.parameters, 14_714_688.0);
+        assert!((sizes.macs / 15.35e9 - 1.0).abs() < 1e-3, "{}", sizes.macs);
+        // 122 values per pixel.
+        assert_eq!((sizes.features, sizes.widest), (122.0 * 224.0 * 224.0, 64.0 * 224.0 * 224.0));
+        // Pooling drops an odd last row.
+        assert_eq!(VggShape::VGG16.sizes(17, 17).features, (64 * 17 * 17 + 128 * 64 + 256 * 16 + 512 * 4 + 512) as f64);
+    }
+}

@@ -1,0 +1,78 @@
+//! How the tokens of a scene file are stored: as plain numbers, or coded for a loss or a size.
+
+use std::path::Path;
+
+use clift_model::{ModelError, TokenCount, TrainedModel};
+
+use crate::codec::token_codec::TokenCodec;
+use crate::error::SceneError;
+use crate::scene::token_coding::{CodedLoss, TokenCoding};
+use crate::scene::token_format::TokenFormat;
+
+/// How the tokens of a scene file are stored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Coding {
+    /// Numbers of one format.
+    Plain(TokenFormat),
+    /// Coded with at most this loss of PSNR in dB by the rates of the model.
+    ExpectedLoss(f64),
+    /// Coded with at most this loss of PSNR in dB, measured on the scene.
+    MeasuredLoss(f64),
+    /// Coded into a file of at most this number of bytes.
+    Bytes(u64),
+}
+
+impl From<TokenCoding> for Coding {
+    fn from(coding: TokenCoding) -> Self {
+        match coding {
+            TokenCoding::Plain(format) => Self::Plain(format),
+            TokenCoding::Coded(loss) => Self::ExpectedLoss(loss.db()),
+        }
+    }
+}
+
+/// A coding with the codec that it needs.
+pub(crate) enum Coder {
+    Plain(TokenFormat),
+    Expected(TokenCodec, f64),
+    Measured(TokenCodec, f64),
+    Bytes(TokenCodec, u64),
+}
+
+impl Coder {
+    /// Reads the codec beside the weights. Without a coding, tokens are coded with the default loss if there is a codec, else
+    /// stored in f16.
+    pub fn new(coding: Option<Coding>, weights: &Path, model: &TrainedModel) -> Result<Self, SceneError> {
+        let architecture = model.config.architecture;
+        if !matches!(coding, None | Some(Coding::Plain(_))) && !architecture.supports_clusters() {
+            return Err(SceneError::request(format!(
+                "the tokens of {architecture} have no codec; store them with --format f32, f16 or int8"
+            )));
+        }
+        let found = || TokenCodec::beside(weights, model);
+        let codec = || found()?.ok_or_else(|| ModelError::NoCodec { path: TokenCodec::path_of(weights) });
+        Ok(match coding {
+            Some(Coding::Plain(format)) => Self::Plain(format),
+            Some(Coding::ExpectedLoss(loss)) => Self::Expected(codec()?, loss),
+            Some(Coding::MeasuredLoss(loss)) => Self::Measured(codec()?, loss),
+            Some(Coding::Bytes(bytes)) => Self::Bytes(codec()?, bytes),
+            None => match found()? {
+                Some(codec) => Self::Expected(codec, CodedLoss::default().db()),
+                None => Self::Plain(TokenFormat::F16),
+            },
+        })
+    }
+
+    /// Returns the number of stored tokens of the best expected PSNR in a file of limited size; `None` without a limit.
+    pub fn best_count(&self, num_views: usize, [height, width]: [usize; 2], model_path: &str) -> Option<TokenCount> {
+        let Self::Bytes(codec, bytes) = self else { return None };
+        let num_patches = codec.model.num_patches(num_views, height, width).unwrap_or(1);
+        let tokens = *bytes as f64 - coded_overhead(num_views, model_path.len()) as f64;
+        Some(TokenCount::Share(codec.rates.share_for_bytes(num_patches, tokens.max(1.0))))
+    }
+}
+
+/// Bytes of a coded file besides its tokens, about: header, normalization, and the views.
+fn coded_overhead(num_views: usize, path_len: usize) -> usize {
+    400 + path_len + 68 * num_views
+}

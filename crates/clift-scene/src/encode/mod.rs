@@ -1,0 +1,15 @@
+//! Encoding of captured images, up to the scene file.
+//!
+//! - `names`: scenes by key, frames by position or file name
+//! - `contexts`: the context views, their default number, their directions
+//! - `encode`: tokens, clusters, condenser
+//! - `cluster_map`: the clusters for a JSON file
+//! - `coding`: how the file stores the tokens
+//! - `encode_scene`: all of it in one call, with a report
+
+pub(crate) mod cluster_map;
+pub(crate) mod coding;
+pub(crate) mod contexts;
+pub(crate) mod encode;
+pub(crate) mod encode_scene;
+pub(crate) mod names;

@@ -1,0 +1,118 @@
+//! A compressed scene: its tokens, and the cameras and sizes that rendering needs besides the weights.
+//!
+//! A `.clift` file with plain tokens is safetensors with a header of fixed length, so that its size is known in advance
+//! ([`scene_file_bytes`]); `coded_file` has the layout of a file with coded tokens:
+//!
+//! | part | type | shape |
+//! |---|---|---|
+//! | length of the header, little-endian | u64 | |
+//! | header: JSON with spaces up to [`HEADER_BYTES`] | | |
+//! | `context_c2w`: normalized poses, camera to world | F64 | `[views, 4, 4]` |
+//! | `context_intrinsics`: `fx, fy, cx, cy` in pixels | F64 | `[views, 4]` |
+//! | `world_mean_c2w`, `world_scale`: the normalization of poses | F64 | `[4, 4]`, `[1]` |
+//! | `token_rays`: `[moment, direction]` through the center of a token's patch, not of learned tokens | F32 | `[tokens, 6]` |
+//! | `token_scales`, with `int8` tokens only | F32 | `[tokens]` |
+//! | `context_frames`: frame number of each view in the capture | U32 | `[views]` |
+//! | `token_ids`: patch of the context views of each token, not of learned tokens | U32 | `[tokens]` |
+//! | `tokens` | F32, F16 or I8 | `[tokens, dim]` |
+//!
+//! `__metadata__` holds strings: `format` = `clift-scene`, `version`, `key` of the scene, `kind` of its tokens, `model`
+//! (sizes and variant of the network as JSON), `renderer` (hash of the renderer's weights), `model_path` (path of the model,
+//! relative to the folder of the file or absolute), `height` and `width` of the context views.
+// S storage tokens, V context views, D width
+
+use clift_core::{Camera, PoseNormalization};
+use clift_model::{ModelConfig, TokenKind, TokenRay};
+
+use crate::scene::token_format::TokenFormat;
+
+/// Length of the header of a scene file in bytes.
+pub const HEADER_BYTES: usize = 2048;
+
+pub(crate) const FORMAT: &str = "clift-scene";
+/// The version of files with plain tokens.
+pub(crate) const VERSION: &str = "2";
+/// The version of files with coded tokens.
+pub(crate) const CODED_VERSION: &str = "5";
+
+/// A compressed scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// Key of the scene in its data set.
+    pub key: String,
+    /// Kind of the tokens.
+    pub kind: TokenKind,
+    /// Sizes and variant of the network.
+    pub model: ModelConfig,
+    /// Hash of the renderer, see [`TrainedModel::renderer_hash`](clift_model::TrainedModel::renderer_hash).
+    pub renderer_hash: String,
+    /// Path of the run or weight file that encoded the scene, relative to the folder of the scene file, or absolute. See
+    /// [`Scene::find_model`].
+    pub model_path: String,
+    /// Height of the context views in pixels.
+    pub height: usize,
+    /// Width of the context views in pixels.
+    pub width: usize,
+    /// Normalized context cameras.
+    pub context: Vec<Camera>,
+    /// Frame number of each context view in the capture.
+    pub context_frames: Vec<u32>,
+    /// Normalization of the poses: its frame has the context cameras.
+    pub world: PoseNormalization,
+    /// Patch of each token, `[S]`: `view * rows * columns + row * columns + column`; its index if
+    /// tokens are learned, whose files do not store it.
+    pub token_ids: Vec<u32>,
+    /// Values of the tokens after rounding, `[S, D]`.
+    pub tokens: Vec<f32>,
+}
+
+impl Scene {
+    /// Returns the number of tokens.
+    pub fn num_tokens(&self) -> usize {
+        self.token_ids.len()
+    }
+
+    /// Returns the ray of every token, through the center of its patch; none of learned tokens.
+    ///
+    /// # Shapes
+    /// - returns `[num_tokens]`, or `[0]`
+    pub fn token_rays(&self) -> Vec<TokenRay> {
+        let ids = if self.model.has_patch_tokens() { &self.token_ids[..] } else { &[] };
+        TokenRay::of_patches(ids, &self.context, self.height, self.width, self.model.patch_size)
+    }
+
+    /// Returns `[moment, direction]` of every token's ray.
+    pub(crate) fn plucker_rays(&self) -> Vec<[f64; 6]> {
+        self.token_rays().iter().map(TokenRay::plucker).collect()
+    }
+
+    /// Returns the size of the scene's file in bytes.
+    pub fn file_bytes(&self, format: TokenFormat) -> u64 {
+        scene_file_bytes(&self.model, self.num_tokens(), self.context.len(), format)
+    }
+}
+
+/// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + S (28 + D b)` for V context views and S tokens of
+/// width D with b bytes per value, and four more bytes per token for `int8`. Learned tokens have neither ray nor
+/// patch, 28 bytes less.
+pub fn scene_file_bytes(model: &ModelConfig, num_tokens: usize, num_views: usize, format: TokenFormat) -> u64 {
+    // Pose and intrinsics in f64, and a frame number.
+    let view = (16 + 4) * 8 + 4;
+    let world = (16 + 1) * 8;
+    // A ray of six f32, and the index of a patch.
+    let place = if model.has_patch_tokens() { 6 * 4 + 4 } else { 0 };
+    let token = place + format.bytes_per_token(model.dim);
+    (8 + HEADER_BYTES + world + num_views * view + num_tokens * token) as u64
+}
+
+/// Returns the safetensors type of tokens.
+pub(crate) const fn dtype_name(format: TokenFormat) -> &'static str {
+    match format {
+        TokenFormat::F32 => "F32",
+        TokenFormat::F16 => "F16",
+        TokenFormat::Int8 => "I8",
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests;

@@ -1,0 +1,25 @@
+//! Devices and networks of the unit tests.
+
+use burn::tensor::Device;
+use clift_model::{Architecture, CliftVariant, CondenserConfig, DeviceName, ModelConfig};
+
+/// Opens every device of this build.
+pub fn devices() -> Vec<Device> {
+    DeviceName::ALL.into_iter().filter(|name| name.is_built()).filter_map(|name| name.open().ok()).collect()
+}
+
+/// Returns a small network of LVSM's paper, whose tokens are learned.
+pub fn small_lvsm() -> ModelConfig {
+    ModelConfig {
+        architecture: Architecture::LvsmEd,
+        variant: CliftVariant::Paper,
+        num_latents: 7,
+        dim: 15,
+        num_heads: 3,
+        feed_forward_dim: 22,
+        num_encoder_blocks: 1,
+        num_renderer_blocks: 3,
+        condenser: CondenserConfig::NONE,
+        ..ModelConfig::default()
+    }
+}
