@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use serde::Serialize;
 
 use crate::config::method::Method;

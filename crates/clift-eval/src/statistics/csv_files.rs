@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use clift_core::replace_file;
-use clift_model::TokenCoding;
+use clift_scene::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
