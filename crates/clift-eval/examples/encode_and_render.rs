@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     // Open the model, and the photos in the size and with the normalization of poses that the model was trained on.
     let path = ModelPath::find(Path::new(run))?;
-    let model = TrainedModel::open(&path, &path.config()?, &DeviceName::Flex.open()?)?;
+    let model = TrainedModel::open(Path::new(run), &DeviceName::Flex.open()?)?;
     let source = open_source(&DatasetRoot::find(Path::new(photos))?, Split::Test, &SourceOptions::default())?.source;
     let config: toml::Table = std::fs::read_to_string(path.dir.join("config.toml"))?.parse()?;
     let data: DataConfig = config["data"].clone().try_into()?;

@@ -91,7 +91,7 @@ pub(crate) fn ensure_codec(
     if config.clusters.grouping != Grouping::Kmeans || !weights.exists() {
         return Ok(());
     }
-    let model = TrainedModel::open(&path, &config.model, device)?;
+    let model = TrainedModel::open_with(&path, &config.model, device)?;
     if matches!(TokenCodec::beside(weights, &model), Ok(Some(_))) {
         return Ok(());
     }

@@ -30,12 +30,21 @@ pub struct TrainedModel {
 }
 
 impl TrainedModel {
+    /// Opens a run, a model directory or a weight file, with the config beside it; see [`ModelPath::find`].
+    ///
+    /// # Errors
+    /// As [`ModelPath::find`], [`ModelPath::config`] and [`TrainedModel::open_with`].
+    pub fn open(path: &Path, device: &Device) -> Result<Self, ModelError> {
+        let path = ModelPath::find(path)?;
+        Self::open_with(&path, &path.config()?, device)
+    }
+
     /// Reads the weights of either stage. The condenser is trained if the file has its parameters.
     ///
     /// # Errors
     /// [`ModelError::BadConfig`] if the number of heads differs from the config of the weights' directory,
     /// [`ModelError::Weights`] for a file that cannot be read or has other names or shapes.
-    pub fn open(path: &ModelPath, config: &ModelConfig, device: &Device) -> Result<Self, ModelError> {
+    pub fn open_with(path: &ModelPath, config: &ModelConfig, device: &Device) -> Result<Self, ModelError> {
         check_sizes(config, &path.dir)?;
         let mut network = Clift::new(config, 0, device);
         let mut loaded = load_part(&mut network, &PathFilter::all(), &path.weights)?;
@@ -109,7 +118,7 @@ mod tests {
         let [stage1, stage2] = ["stage1", "stage2"].map(path);
         save_part(&network, &Clift::stage1_part(), &stage1.weights).unwrap();
         save_weights(&network, &stage2.weights).unwrap();
-        let models = [&stage1, &stage2].map(|path| TrainedModel::open(path, &config, &device).unwrap());
+        let models = [&stage1, &stage2].map(|path| TrainedModel::open_with(path, &config, &device).unwrap());
         assert_eq!([0, 1].map(|i| models[i].has_condenser), [false, true]);
         assert!(models[0].has_encoder_of(&models[1]));
         assert_eq!(weights_hash(&models[1].network), weights_hash(&network));

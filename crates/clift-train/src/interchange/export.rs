@@ -131,7 +131,7 @@ fn export_published(
 /// not copied.
 fn export_f16(config: &Config, model: &ModelPath, folder: &Path) -> Result<Exported, TrainError> {
     require_absent(folder)?;
-    let trained = TrainedModel::open(model, &config.model, &DeviceName::default().open()?)?;
+    let trained = TrainedModel::open_with(model, &config.model, &DeviceName::default().open()?)?;
     let part = if trained.has_condenser { PathFilter::all() } else { Clift::stage1_part() };
     let parameters = publish_model_dir(folder, |written| {
         save_part_f16(&trained.network, &part, &written.weights)?;

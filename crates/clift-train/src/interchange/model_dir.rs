@@ -69,7 +69,7 @@ pub(crate) fn write_model_dir(
         write_file(&written.dir.join("config.toml"), config_text.as_bytes())?;
         let import_text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", folder))?;
         write_file(&written.dir.join("import.json"), &import_text)?;
-        let model = TrainedModel::open(written, &config.model, &config.device.open()?)?;
+        let model = TrainedModel::open_with(written, &config.model, &config.device.open()?)?;
         if let Some(codec) = TokenCodec::beside(file, &model)? {
             codec.write(&TokenCodec::path_of(&written.weights))?;
         }

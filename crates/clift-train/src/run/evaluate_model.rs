@@ -33,9 +33,9 @@ pub fn evaluate_model(
 ) -> Result<Summary, TrainError> {
     config.validate()?;
     let device = config.device.open()?;
-    let last = TrainedModel::open(model, &config.model, &device)?;
+    let last = TrainedModel::open_with(model, &config.model, &device)?;
     let mut models = EvalModels::new(match stage1 {
-        Some(path) => TrainedModel::open(path, &config.model, &device)?,
+        Some(path) => TrainedModel::open_with(path, &config.model, &device)?,
         None => last.clone(),
     });
     if let Some(path) = stage1.filter(|_| !models.stage1.has_encoder_of(&last)) {
@@ -72,7 +72,7 @@ pub fn evaluate_model(
 /// Opens the stage-2 model of the run of `config`, which must be trained on the encoder of `stage1`.
 pub(crate) fn open_stage2(config: &Config, stage1: &TrainedModel) -> Result<TrainedModel, TrainError> {
     let found = weights(config, Stage::Stage2, "the weights of stage 2")?;
-    let model = TrainedModel::open(&found, &config.model, &stage1.device)?;
+    let model = TrainedModel::open_with(&found, &config.model, &stage1.device)?;
     let path = found.weights;
     if !model.has_condenser {
         let reason = "the file has no condenser".into();
@@ -102,7 +102,7 @@ pub(crate) fn open_whole(
     let found = weights(config, Stage::Stage1, "the weights of stage 1")?;
     // All methods are drawn on as many patch grids.
     let model = ModelConfig { patch_grids: evaluated.model.patch_grids, ..config.model.clone() };
-    Ok(TrainedModel::open(&found, &model, device)?)
+    Ok(TrainedModel::open_with(&found, &model, device)?)
 }
 
 /// Finds the weights of a stage, `what` in messages.

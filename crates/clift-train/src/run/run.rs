@@ -228,7 +228,7 @@ impl Run {
     fn models(&self, sink: &mut dyn Sink) -> Result<EvalModels, TrainError> {
         let weights = self.require_stage1(RunStep::Eval)?;
         let path = ModelPath { dir: self.config.run_dir.clone(), weights };
-        let mut models = EvalModels::new(TrainedModel::open(&path, &self.config.model, &self.device)?);
+        let mut models = EvalModels::new(TrainedModel::open_with(&path, &self.config.model, &self.device)?);
         if self.weights(Stage::Stage2).exists() {
             let stage2 = open_stage2(&self.config, &models.stage1)?;
             models.codec = TokenCodec::beside(&self.weights(Stage::Stage2), &stage2)?.map(Arc::new);

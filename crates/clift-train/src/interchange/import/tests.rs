@@ -66,7 +66,7 @@ fn assert_computes(folder: &Path, name: &str) {
         config.device = device;
         let path = ModelPath::find(folder).unwrap();
         assert_eq!(path.config().unwrap(), config.model);
-        let trained = TrainedModel::open(&path, &config.model, &config.device.open().unwrap()).unwrap();
+        let trained = TrainedModel::open_with(&path, &config.model, &config.device.open().unwrap()).unwrap();
         let (network, device) = (&trained.network, &trained.device);
         let images = reference.tensor("input.context_images", device);
         let features = network.features(&Views { images, cameras: cameras(&reference, "context", device) });

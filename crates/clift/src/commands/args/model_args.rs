@@ -100,7 +100,7 @@ impl ModelArgs {
 
     /// Reads the weights.
     pub fn open(&self) -> Result<TrainedModel, ModelError> {
-        TrainedModel::open(&self.path, &self.config.model, &self.config.device.open()?)
+        TrainedModel::open_with(&self.path, &self.config.model, &self.config.device.open()?)
     }
 }
 
