@@ -86,6 +86,8 @@ pub(crate) fn widest_turn_deg(cameras: &[Camera]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use clift_core::{DMat3, Intrinsics};
+
     use super::*;
 
     #[test]
@@ -99,5 +101,15 @@ mod tests {
         assert_eq!(message(&[0, 10]), "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9");
         assert_eq!(message(&[3, 3]), "`--context` = 3,3: write at least two frames, each once");
         assert_eq!(message(&[3]), "`--context` = 3: write at least two frames, each once");
+    }
+
+    #[test]
+    fn the_widest_turn_is_between_any_two_cameras() {
+        let camera = |yaw_deg: f64| Camera {
+            c2w: Pose { rotation: DMat3::from_rotation_y(yaw_deg.to_radians()), ..Pose::IDENTITY },
+            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 },
+        };
+        assert!((widest_turn_deg(&[camera(-30.0), camera(0.0), camera(120.0)]) - 150.0).abs() < 1e-9);
+        assert!(widest_turn_deg(&[camera(20.0)]) < 1e-5);
     }
 }
