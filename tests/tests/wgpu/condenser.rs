@@ -1,7 +1,9 @@
 //! All forms of the condenser, and attention inside clusters.
 
 use burn::tensor::{Int, Tensor};
-use clift_model::{CliftVariant, Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, cluster_attention};
+use clift_model::{
+    CliftVariant, Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, Tokens, cluster_attention,
+};
 
 use crate::place::{BATCH, DIM, NUM_TOKENS, Place, clusters, network};
 use crate::table::{Case, Tolerance, Values};
