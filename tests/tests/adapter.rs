@@ -21,9 +21,10 @@ fn adapter_limits_hold_on_the_open_device() {
     assert_eq!(device.supports_dtype(DType::F16), used.has_f16);
     assert_eq!(Precision::F16.check("precision", &device).is_ok(), used.has_f16);
 
-    // A tensor of the reported size (at most 128 MiB) can be made and read, as the checks before a run assume.
+    // A tensor of the reported size (at most 128 MiB) can be made and read, as the checks before a run assume. (Burn's sum of
+    // as many values is wrong on software Vulkan.)
     let len = (most.min(128 << 20) / 4) as usize;
-    let ones = Tensor::<1>::ones([len], &device);
-    let share = ones.sum().into_scalar::<f32>() / len as f32;
-    assert!((share - 1.0).abs() < 1e-3, "{share}");
+    let values = Tensor::<1>::ones([len], &device).into_data();
+    let values = values.as_slice::<f32>().expect("f32");
+    assert_eq!((values.len(), values.iter().filter(|&&value| value == 1.0).count()), (len, len));
 }

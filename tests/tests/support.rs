@@ -88,8 +88,12 @@ pub fn clift<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Ra
 
 pub const BINARY: &str = env!("CARGO_BIN_EXE_clift-under-test");
 
-/// Starts a command that [`finish`] waits for.
+/// Starts a command that [`finish`] waits for, on the CPU: in a build with wgpu it finds no adapter, whose kernels would take
+/// minutes to compile.
 pub fn start(command: &mut Command) -> Child {
+    for variable in ["VK_ICD_FILENAMES", "VK_DRIVER_FILES", "__EGL_VENDOR_LIBRARY_FILENAMES"] {
+        command.env(variable, "/nonexistent");
+    }
     let piped = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     piped.spawn().expect("the binary under test starts")
 }
