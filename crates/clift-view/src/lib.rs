@@ -4,7 +4,8 @@
 //! [`ViewServer::run`] owns the device and renders; a second thread serves HTTP and web sockets.
 //!
 //! ```no_run
-//! use clift_model::{DeviceName, Scene, load_renderer};
+//! use clift_model::DeviceName;
+//! use clift_scene::{Scene, load_renderer};
 //! use clift_view::{SceneFile, SceneSet, ViewServer};
 //!
 //! let device = DeviceName::Flex.open()?;
