@@ -28,7 +28,7 @@ pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> T
 pub fn batch(place: &Place, stage: Stage) -> StageBatch {
     let tokens = match stage {
         Stage::Stage2 => BatchTokens::Clusters(clusters()),
-        _ => BatchTokens::Subsets(subsets(5)),
+        Stage::Stage1 => BatchTokens::Subsets(subsets(5)),
     };
     StageBatch { step: 0, clips: place.clips(), tokens, skipped: Vec::new() }
 }
