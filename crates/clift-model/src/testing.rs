@@ -9,15 +9,10 @@ use crate::device::name::DeviceName;
 use crate::network::architecture::{Architecture, CliftVariant};
 use crate::network::config::{CondenserConfig, ModelConfig};
 
-/// Opens the CPU devices of this build. The suite `wgpu_suite` compares wgpu with them.
+/// Opens the CPU devices of this build, which support f64. The suite `wgpu_suite` compares wgpu with them.
 pub fn devices() -> Vec<Device> {
     let names = [DeviceName::Flex, DeviceName::Ndarray].into_iter().filter(|name| name.is_built());
     names.map(|name| name.open().expect("a CPU device")).collect()
-}
-
-/// Opens the CPU devices, which support f64.
-pub fn cpu_devices() -> Vec<Device> {
-    [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().expect("a CPU device")).into()
 }
 
 /// Returns a small network of a variant; all sizes differ.

@@ -112,7 +112,7 @@ pub struct Summary {
     pub num_views: usize,
     /// Skipped scenes; `skipped.json` has the reasons.
     pub num_skipped: usize,
-    /// What was measured on.
+    /// Origin of the measured views.
     pub split: Option<EvalSplit>,
     /// Target views that are also contexts: the input holds their images.
     pub num_context_targets: usize,

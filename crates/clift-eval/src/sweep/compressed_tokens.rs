@@ -65,7 +65,7 @@ impl<'a> CompressedTokens<'a> {
         Ok(Self { tokens, ids, model, file_bytes: Some(bytes) })
     }
 
-    /// Returns all tokens of a network without clusters, rounded like those of a scene file.
+    /// Returns all tokens of a network without clusters, rounded as a scene file rounds them.
     pub fn whole(
         model: &'a TrainedModel,
         tokens: Tokens,

@@ -199,7 +199,7 @@ mod tests {
 
     use super::*;
     use crate::ops::attention::cross_sdpa;
-    use crate::testing::{Fixture, assert_close, cpu_devices, devices, output_and_gradients};
+    use crate::testing::{Fixture, assert_close, devices, output_and_gradients};
 
     fn maker(encoding: CameraEncoding) -> TransformMaker {
         let config = ModelConfig { camera_encoding: encoding, dim: 32, num_heads: 2, ..ModelConfig::default() };
@@ -217,7 +217,7 @@ mod tests {
     fn camera_relative_attention_equals_pytorch_in_f32_and_f64() {
         let fixture = Fixture::open("camera_attention");
         // Poses are f32 values, so that their transpose is the inverse to 1e-7 only.
-        let wide = cpu_devices().into_iter().map(|device| (device, DType::F64, 1e-6));
+        let wide = devices().into_iter().map(|device| (device, DType::F64, 1e-6));
         let cases = devices().into_iter().map(|device| (device, DType::F32, 1e-5)).chain(wide);
         for (device, dtype, tolerance) in cases {
             let cameras = |prefix: &str| Cameras {

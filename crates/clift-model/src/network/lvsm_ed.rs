@@ -256,12 +256,12 @@ impl JointDecoder {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{check_gradients, cpu_devices, random, small_lvsm, to_f64};
+    use crate::testing::{check_gradients, devices, random, small_lvsm, to_f64};
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
         for variant in [CliftVariant::Paper, CliftVariant::ReleasedRe10k] {
-            for device in cpu_devices() {
+            for device in devices() {
                 let config = ModelConfig { dim: 6, num_heads: 3, num_renderer_blocks: 2, ..small_lvsm(variant) };
                 // PyTorch's distributions: LVSM's small matrices give near-uniform attention.
                 let style = LayerStyle { has_query_key_norms: !variant.is_released(), ..LayerStyle::PYTORCH };

@@ -44,7 +44,7 @@ impl<'a, E> Pass<'a, E> {
         1 + self.model.encoder.blocks().num_blocks()
     }
 
-    /// Returns the number of blocks: those of the encoder, the selection of tokens, the embedding of the target rays, and the
+    /// Returns the number of blocks: encoder blocks, the selection of tokens, the embedding of the target rays, and the
     /// blocks of the renderer.
     pub fn num_blocks(&self) -> usize {
         self.num_encoder_blocks() + 2 + self.model.renderer.blocks().num_blocks()

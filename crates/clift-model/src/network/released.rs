@@ -134,12 +134,12 @@ mod tests {
     use burn::tensor::Tensor;
 
     use super::*;
-    use crate::testing::{check_gradients, cpu_devices, random, small_config, to_f64};
+    use crate::testing::{check_gradients, devices, random, small_config, to_f64};
     use crate::tokens::clusters::{Clusters, SceneClusters};
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
-        for device in cpu_devices() {
+        for device in devices() {
             let config = ModelConfig { dim: 16, num_heads: 4, ..small_config(CliftVariant::ReleasedRe10k) };
             let mut init = Init::new(5, &device);
             let mut condenser = ReleasedCondenser::new(&config, &mut init);

@@ -140,7 +140,7 @@ mod tests {
     use super::*;
     use crate::ops::composed::attention::{MAX_SCORES, query_chunks};
     use crate::testing::{
-        Fixture, assert_close, assert_finite, check_equal, check_gradients, check_native, cpu_devices, devices,
+        Fixture, assert_close, assert_finite, check_equal, check_gradients, check_native, devices,
         output_and_gradients, random,
     };
 
@@ -175,7 +175,7 @@ mod tests {
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
-        for device in cpu_devices() {
+        for device in devices() {
             let inputs = [random([2, 5, 8], 1, &device), random([2, 7, 8], 2, &device), random([2, 7, 8], 3, &device)];
             check_gradients(inputs, |[q, k, v]| sdpa(q, k, v, 2), 1e-6);
         }
@@ -199,7 +199,7 @@ mod tests {
 
     #[test]
     fn packed_inputs_equal_separate_inputs() {
-        for device in cpu_devices() {
+        for device in devices() {
             let (packed, cotangent) = (random([2, 5, 24], 1, &device), random([2, 5, 8], 2, &device));
             let separate = [0, 1, 2].map(|part| packed.clone().narrow(2, 8 * part, 8));
             let (output, [grad]) = output_and_gradients([packed], cotangent.clone(), |[packed]| self_sdpa(packed, 2));

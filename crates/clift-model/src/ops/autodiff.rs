@@ -21,7 +21,7 @@ pub(crate) trait Differentiable<B: Backend, const N: usize>: Clone + Debug + Sen
     /// Computes the output, and what the gradients need.
     fn forward_saving(&self, inputs: [FloatTensor<B>; N]) -> (FloatTensor<B>, Self::Saved);
 
-    /// Computes the gradients of the inputs from that of the output. Those that are not `needed` may be `None`.
+    /// Computes the gradients of the inputs from the gradient of the output. A gradient that is not `needed` may be `None`.
     fn gradients(
         &self,
         saved: Self::Saved,

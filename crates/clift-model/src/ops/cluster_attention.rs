@@ -92,7 +92,7 @@ mod tests {
     use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::testing::{assert_close, check_gradients, check_native, cpu_devices, devices, random, to_vec};
+    use crate::testing::{assert_close, check_gradients, check_native, devices, random, to_vec};
 
     fn cluster_attention(
         query: Tensor<3>,
@@ -122,7 +122,7 @@ mod tests {
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
-        for device in cpu_devices() {
+        for device in devices() {
             check_gradients(inputs(&device), attend, 1e-6);
         }
     }

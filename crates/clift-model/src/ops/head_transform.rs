@@ -73,14 +73,14 @@ mod tests {
     use burn::tensor::Device;
 
     use super::*;
-    use crate::testing::{check_gradients, check_native, cpu_devices, random};
+    use crate::testing::{check_gradients, check_native, devices, random};
 
     const CASES: [(&[HeadTransform], usize, usize); 4] =
         [(QUERY_KEY_VALUE, 2, 8), (QUERY, 1, 16), (KEY_VALUE, 3, 32), (OUTPUT, 2, 24)];
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
-        for device in cpu_devices() {
+        for device in devices() {
             for (parts, num_heads, head_width) in CASES {
                 let transforms = random([2, 3, transform_len(head_width)], 1, &device);
                 let x = random([2, 3, parts.len() * num_heads * head_width], 2, &device);

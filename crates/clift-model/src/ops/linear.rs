@@ -212,7 +212,7 @@ mod tests {
 
     use super::*;
     use crate::testing::{
-        assert_close, assert_finite, check_gradients, check_native, cpu_devices, devices, output_and_gradients, random,
+        assert_close, assert_finite, check_gradients, check_native, devices, output_and_gradients, random,
     };
 
     /// Applies a norm before an identity layer; gamma and beta are `[1, 1, D]`.
@@ -228,7 +228,7 @@ mod tests {
 
     #[test]
     fn norm_gradients_equal_central_differences_in_f64() {
-        for device in cpu_devices() {
+        for device in devices() {
             let inputs = [random([2, 5, 8], 1, &device), random([1, 1, 8], 2, &device), random([1, 1, 8], 3, &device)];
             check_gradients(inputs, |[x, gamma, beta]| norm(x, gamma, beta), 1e-6);
         }

@@ -67,8 +67,7 @@ mod tests {
 
     use super::*;
     use crate::testing::{
-        assert_close, assert_finite, check_equal, check_gradients, check_native, cpu_devices, devices,
-        output_and_gradients, random,
+        assert_close, assert_finite, check_equal, check_gradients, check_native, devices, output_and_gradients, random,
     };
 
     /// Normalizes the first two of three parts; gammas are `[1, 1, E]`.
@@ -101,7 +100,7 @@ mod tests {
 
     #[test]
     fn gradients_equal_central_differences_and_plain_autodiff_in_f64() {
-        for device in cpu_devices() {
+        for device in devices() {
             let [x, query, key] = inputs(2, 6, &device);
             check_gradients([x.narrow(1, 0, 3), query, key], norm, 1e-6);
             let cotangent = random([2, 35, 36], 9, &device);

@@ -51,7 +51,7 @@ mod tests {
     use clift_core::{Camera, DMat3, DVec3, Intrinsics, Pose};
 
     use super::*;
-    use crate::testing::{Fixture, assert_close, cpu_devices, devices, to_vec};
+    use crate::testing::{Fixture, assert_close, devices, to_vec};
 
     #[test]
     fn rays_equal_those_of_the_camera_on_the_host() {
@@ -77,7 +77,7 @@ mod tests {
             // f32 against f64: a few roundings of values up to 2.
             assert_close(&rays, &fixture.tensor::<5>("output.plucker", &device), 2e-6);
         }
-        for device in cpu_devices() {
+        for device in devices() {
             let c2w = fixture.tensor_f64("input.c2w", &device);
             let intrinsics = fixture.tensor_f64("input.intrinsics", &device);
             let rays = plucker(&Cameras { height, width, c2w, intrinsics });

@@ -1,4 +1,4 @@
-//! How the tokens of a scene file are stored: as plain numbers, or coded for a loss or a size.
+//! Storage of the tokens of a scene file: plain numbers, or coded for a loss or a size.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use crate::error::SceneError;
 use crate::scene::token_coding::{CodedLoss, TokenCoding};
 use crate::scene::token_format::TokenFormat;
 
-/// How the tokens of a scene file are stored.
+/// Storage of the tokens of a scene file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Coding {
     /// Numbers of one format.

@@ -128,7 +128,9 @@ impl Checkpoints {
             let is_whole = |older: &u64| *older < step && verify(&self.path_of(*older)).is_ok();
             let fix = match self.steps().unwrap_or_default().into_iter().rfind(is_whole) {
                 Some(older) => format!("move {} to another folder to resume from {}", name_of(step), name_of(older)),
-                None => "the stage has no whole one; start a new run with --fresh, which keeps this one".into(),
+                None => {
+                    "the stage has no undamaged checkpoint; start a new run with --fresh, which renames this one".into()
+                }
             };
             TrainError::Damaged { source: Box::new(source), fix }
         })?;

@@ -115,7 +115,7 @@ mod tests {
     use crate::network::architecture::CliftVariant;
     use crate::network::init::LayerStyle;
     use crate::testing::{
-        Fixture, assert_close, cpu_devices, devices, load_weights, output_and_gradients, random, small_lvsm, to_f64,
+        Fixture, assert_close, devices, load_weights, output_and_gradients, random, small_lvsm, to_f64,
         weight_gradients,
     };
 
@@ -158,7 +158,7 @@ mod tests {
     #[test]
     fn first_rows_equal_those_of_the_whole_block() {
         for variant in [CliftVariant::Paper, CliftVariant::ReleasedRe10k] {
-            for device in cpu_devices() {
+            for device in devices() {
                 let config = small_lvsm(variant);
                 let style = LayerStyle { has_query_key_norms: !variant.is_released(), ..LayerStyle::PYTORCH };
                 let block = to_f64(EncoderBlock::new(&config, &mut Init::with_style(style, 3, &device))).train();

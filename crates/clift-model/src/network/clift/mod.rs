@@ -2,7 +2,7 @@
 //!
 //! `encoder` makes tokens of context views, `condenser` (equations 1 to 4) writes every cluster of tokens into its
 //! centroid, `renderer` decodes images. `paper` has the sizes, checks and layers of the paper's network; `released`, beside
-//! this folder, has those of the published checkpoints.
+//! this folder, has the sizes, checks and layers of the published checkpoints.
 
 pub(crate) mod condenser;
 pub(crate) mod encoder;

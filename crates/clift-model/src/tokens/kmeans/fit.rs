@@ -103,7 +103,7 @@ mod tests {
     use burn::tensor::Device;
 
     use super::*;
-    use crate::testing::{Fixture, cpu_devices, devices, random, to_vec};
+    use crate::testing::{Fixture, devices, random, to_vec};
     use crate::tokens::kmeans::labels::ROUNDING;
 
     fn assert_valid(fit: &KMeansFit, num_clusters: usize) {
@@ -214,7 +214,7 @@ mod tests {
     #[test]
     fn a_converged_fit_is_a_local_optimum() {
         let kmeans = KMeans { max_iterations: 1000, tolerance: -1.0 };
-        for device in cpu_devices() {
+        for device in devices() {
             let tokens = random([1, 200, 6], 12, &device);
             let fit = kmeans.fit(tokens.clone(), 23, &[4]).expect("fits");
             let tokens: Vec<Vec<f64>> = to_vec(tokens).chunks(6).map(<[f64]>::to_vec).collect();

@@ -153,7 +153,7 @@ mod tests {
     use burn::tensor::{DType, Device, Tensor};
 
     use super::*;
-    use crate::testing::{cpu_devices, devices, random, to_vec};
+    use crate::testing::{devices, random, to_vec};
 
     fn samples(tokens: &Tensor<2>) -> Samples {
         Samples::new(tokens.clone()).expect("finite")
@@ -191,7 +191,7 @@ mod tests {
 
     #[test]
     fn centers_are_distinct_and_better_than_random() {
-        for device in cpu_devices() {
+        for device in devices() {
             let samples = samples(&clustered(&device));
             // The table of all pairs, and pools of 160 and 80 of 400 tokens.
             for max_table_len in [MAX_TABLE_LEN, 160 * 400, 0] {
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn a_sampled_pool_is_as_good_as_all_tokens() {
-        for device in cpu_devices() {
+        for device in devices() {
             let samples = samples(&random([600, 8], 23, &device).cast(DType::F32));
             let mean = |max_table_len| {
                 let one = |start| potential(&samples, &seed(&samples, 50, start, max_table_len));
