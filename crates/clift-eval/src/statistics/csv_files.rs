@@ -67,10 +67,10 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
     write(path, rows).map_err(EvalError::io("writing the metrics of the views", path))
 }
 
-/// Reads `views.csv`. Of two rows of one view under one key the first counts.
+/// Reads `views.csv`.
 ///
 /// # Errors
-/// [`EvalError::NotComparable`] for a file of another format.
+/// [`EvalError::NotComparable`] for a file of another format, and for a view with two rows under one key.
 pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
     let bad = |error: csv::Error| EvalError::NotComparable { reason: error.to_string(), path: path.into() };
     let mut results = EvalResults::default();
@@ -80,7 +80,10 @@ pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
         let ViewRow { psnr, ssim, lpips_vgg, render_s, select_s, .. } = row;
         let key = EvalKey { method, num_storage_tokens, num_render_tokens, tokens };
         let view = ViewMetrics { psnr, ssim, lpips_vgg, render_s, select_s };
-        results.add(&row.scene, row.target_frame, key, view);
+        if !results.add(&row.scene, row.target_frame, key, view) {
+            let reason = format!("frame {} of scene {} has two rows of {}", row.target_frame, row.scene, method.name());
+            return Err(EvalError::NotComparable { reason, path: path.into() });
+        }
     }
     Ok(results)
 }
@@ -151,5 +154,8 @@ attic,nearest_view,0,0,,1,18.5,,
             write_scenes(&results, &path).unwrap();
             assert_eq!(std::fs::read_to_string(&path).unwrap(), scenes);
         }
+        std::fs::write(&path, format!("{views}attic,2,clift,64,32,24.0,0.5,0.75,0.25,,f16\n")).unwrap();
+        let message = read_views(&path).unwrap_err().to_string();
+        assert!(message.contains("frame 2 of scene attic has two rows of clift"), "{message}");
     }
 }

@@ -35,17 +35,19 @@ pub struct EvalResults {
     pub(crate) lpips_sha256: Option<String>,
     /// How rendered tokens were selected; `None` where every view was rendered from all stored tokens.
     pub(crate) selection: Option<Selection>,
-    /// What the views are taken from; `None` if unknown.
+    /// Origin of the views; `None` if unknown.
     pub(crate) split: Option<EvalSplit>,
     /// Scene and frame of the targets that are also contexts.
     pub(crate) context_targets: BTreeSet<(String, usize)>,
 }
 
 impl EvalResults {
-    /// Adds one view of a scene. Of two results for a view under one key the first counts.
-    pub fn add(&mut self, scene: &str, frame: usize, key: EvalKey, view: ViewMetrics) {
-        let scenes = self.views.entry(key).or_default();
-        scenes.entry(scene.to_owned()).or_default().entry(frame).or_insert(view);
+    /// Adds one view of a scene. Of two results for a view under one key the first counts. Returns whether the view is new.
+    pub fn add(&mut self, scene: &str, frame: usize, key: EvalKey, view: ViewMetrics) -> bool {
+        let frames = self.views.entry(key).or_default().entry(scene.to_owned()).or_default();
+        let num_views = frames.len();
+        frames.entry(frame).or_insert(view);
+        frames.len() > num_views
     }
 
     /// Adds the views that another process has measured of other scenes.
