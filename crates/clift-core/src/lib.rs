@@ -29,6 +29,7 @@ pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm, widest_fov_deg};
 pub use geometry::camera_path::{focus_distance, interpolate_path, mean_intrinsics, orbit_path};
 pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale, check_near};
 pub use geometry::pose::Pose;
+pub use geometry::view_distance::ViewDistance;
 pub use glam::{DMat3, DVec3};
 
 // Values of a configuration.

@@ -13,7 +13,7 @@ use std::path::Path;
 use clift_data::{ClipReader, DataConfig, DatasetRoot, SourceOptions, Split, open_source};
 use clift_eval::Canvas;
 use clift_model::{DeviceName, ModelPath, SelectionPreset, TrainedModel};
-use clift_scene::{Coding, EncodeOptions, SceneOptions, SceneRenderer, TokenFormat, encode_scene};
+use clift_scene::{Coding, ContextChoice, EncodeOptions, SceneOptions, SceneRenderer, TokenFormat, encode_scene};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -29,7 +29,11 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     // Encode the first scene: four context views, a quarter of the tokens, stored as f16.
     let options = SceneOptions {
-        encode: EncodeOptions { num_context: 4, model_path: run.clone(), ..EncodeOptions::default() },
+        encode: EncodeOptions {
+            context: ContextChoice::Spread(4),
+            model_path: run.clone(),
+            ..EncodeOptions::default()
+        },
         coding: Some(Coding::Plain(TokenFormat::F16)),
         weights: path.weights,
         out: format!("{out}.clift").into(),
@@ -44,8 +48,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     Canvas::from_unit(&view.pixels, scene.width, scene.height)?.write_png(Path::new(&format!("{out}.png")))?;
 
     // A rendering of a photo that is not a context view, compared with the photo.
-    if let Some(check) = written.held_out {
-        println!("frame {}: {:.2} dB, the nearest context view {:.2} dB", check.frame, check.psnr, check.nearest_psnr);
+    for check in written.others {
+        println!("frame {}: {:.2} dB, the nearest context view {:.2} dB", check.frame, check.psnr, check.baseline_psnr);
     }
     Ok(())
 }

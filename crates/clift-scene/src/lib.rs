@@ -3,7 +3,7 @@
 //! [`encode_scene`] does what `clift encode` does: it encodes images, writes the file and checks a rendering. Its steps:
 //! [`encode`] compresses images of a scene to a [`Scene`], [`Scene::write`] stores its tokens in a number format and
 //! [`Scene::write_coded`] with the [`TokenCodec`] of the model, which [`fit_codec`] fits on training scenes.
-//! [`SceneRenderer`] renders views, and [`HeldOutFrame`] compares a rendering with a photo.
+//! [`SceneRenderer`] renders views, and [`CheckedView`] compares a rendering with a photo.
 //!
 //! The example `encode_and_render` encodes a folder of photos and renders a view; `read_scene` prints a scene file.
 
@@ -22,7 +22,7 @@ pub use error::SceneError;
 // Encode images
 pub use encode::cluster_map::ClusterMap;
 pub use encode::coding::Coding;
-pub use encode::contexts::{MAX_TURN_DEG, default_num_context, spread_contexts};
+pub use encode::contexts::{ContextChoice, Contexts};
 pub use encode::encode::{EncodeOptions, EncodedScene, encode};
 pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
 pub use encode::names::{find_scene, frame_positions};
@@ -36,7 +36,7 @@ pub use scene::token_format::TokenFormat;
 pub use scene::write::check_output_path;
 // A check of a scene, and the baselines of renderings
 pub use check::baselines::{mean_image, nearest_image, view_image};
-pub use check::held_out_frame::HeldOutFrame;
+pub use check::view_check::{CheckedView, MIN_CONTEXT_PSNR};
 // The coder of tokens in scene files
 pub use codec::histogram::{Distributions, Histograms};
 pub use codec::prediction::{NeighbourProducts, Places, Prediction};

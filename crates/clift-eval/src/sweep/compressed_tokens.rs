@@ -49,7 +49,7 @@ impl<'a> CompressedTokens<'a> {
         let (num_tokens, num_views) = (ids.len(), clip.context.num_views());
         let (tokens, bytes) = match coding {
             TokenCoding::Plain(format) => {
-                let bytes = scene_file_bytes(&model.config, num_tokens, num_views, format);
+                let bytes = scene_file_bytes(&model.config, num_tokens, (num_views, 1, num_views), format);
                 (rounded(tokens, format)?, bytes)
             }
             TokenCoding::Coded(loss) => {
@@ -72,7 +72,7 @@ impl<'a> CompressedTokens<'a> {
         format: TokenFormat,
         num_views: usize,
     ) -> Result<Self, EvalError> {
-        let bytes = scene_file_bytes(&model.config, tokens.dims()[1], num_views, format);
+        let bytes = scene_file_bytes(&model.config, tokens.dims()[1], (num_views, 1, num_views), format);
         Ok(Self { tokens: rounded(tokens, format)?, ids: Vec::new(), model, file_bytes: Some(bytes) })
     }
 }
@@ -107,6 +107,7 @@ fn scene_of(clip: &Clip, codec: &TokenCodec, ids: &[u32], tokens: Vec<f32>, mode
         width: clip.context.width,
         context: clip.context.cameras.clone(),
         context_frames: clip.context.frame_index.iter().map(|&frame| frame as u32).collect(),
+        groups: Scene::single_group(clip.context.num_views()),
         world: PoseNormalization { mean_c2w: Pose::IDENTITY, scale: 1.0 },
         token_ids: ids.into(),
         tokens,

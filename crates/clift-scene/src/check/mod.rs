@@ -1,7 +1,7 @@
-//! A check of a scene: a frame that is not a context view, rendered and compared with a copy of the nearest context view.
+//! Checks of a scene: renderings beside photos.
 //!
 //! - `baselines`: nearest context view, mean of the context views
-//! - `held_out_frame`: the rendered frame
+//! - `view_check`: held-out frames and context views, rendered
 
 pub(crate) mod baselines;
-pub(crate) mod held_out_frame;
+pub(crate) mod view_check;

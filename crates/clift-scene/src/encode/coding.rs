@@ -5,6 +5,7 @@ use std::path::Path;
 use clift_model::{ModelError, TokenCount, TrainedModel};
 
 use crate::codec::token_codec::TokenCodec;
+use crate::encode::contexts::Contexts;
 use crate::error::SceneError;
 use crate::scene::token_coding::{CodedLoss, TokenCoding};
 use crate::scene::token_format::TokenFormat;
@@ -64,15 +65,17 @@ impl Coder {
     }
 
     /// Returns the number of stored tokens of the best expected PSNR in a file of limited size; `None` without a limit.
-    pub fn best_count(&self, num_views: usize, [height, width]: [usize; 2], model_path: &str) -> Option<TokenCount> {
+    pub fn best_count(&self, contexts: &Contexts, [height, width]: [usize; 2], model_path: &str) -> Option<TokenCount> {
         let Self::Bytes(codec, bytes) = self else { return None };
-        let num_patches = codec.model.num_patches(num_views, height, width).unwrap_or(1);
-        let tokens = *bytes as f64 - coded_overhead(num_views, model_path.len()) as f64;
+        let num_members = contexts.num_members();
+        let num_patches = codec.model.num_patches(num_members, height, width).unwrap_or(1);
+        let overhead = coded_overhead(contexts.frames.len(), num_members, model_path.len());
+        let tokens = *bytes as f64 - overhead as f64;
         Some(TokenCount::Share(codec.rates.share_for_bytes(num_patches, tokens.max(1.0))))
     }
 }
 
-/// Bytes of a coded file besides its tokens, about: header, normalization, and the views.
-fn coded_overhead(num_views: usize, path_len: usize) -> usize {
-    400 + path_len + 68 * num_views
+/// Bytes of a coded file besides its tokens, about: header, normalization, the views, and the groups.
+fn coded_overhead(num_views: usize, num_members: usize, path_len: usize) -> usize {
+    400 + path_len + 68 * num_views + 3 * num_members
 }

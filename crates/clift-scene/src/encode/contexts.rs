@@ -1,115 +1,164 @@
-//! The context views of a scene: requested frames, or frames along the camera path, and how far the views turn.
+//! The context views of a scene: requested frames, frames along the camera path, or groups of neighbours.
 
-use clift_core::{Camera, DVec3, Pose, PoseNormalization};
-use clift_data::{ClipReader, DataError, SceneSource, contexts_along_path};
+use clift_core::{Pose, PoseNormalization, ViewDistance};
+use clift_data::{ClipReader, DataError, contexts_along_path, is_held_out};
 use clift_model::{CameraEncoding, ModelConfig, ModelError};
 
+use crate::encode::groups::{nearest_views, neighbour_groups};
 use crate::error::SceneError;
 
-/// Angle between two context views, in degrees, above which `models/rooms` renders noise
-/// (models/rooms/README.md, "Limits").
-pub const MAX_TURN_DEG: f64 = 140.0;
+/// Most context views of a scene in groups.
+const MAX_VIEWS: usize = 128;
+/// Groups of neighbours over the context views, by default.
+const GROUPS_PER_VIEW: f64 = 0.75;
 
-/// Returns the default number of context views of a captured scene, for a network that was trained with up to `trained`
-/// views. With camera-relative attention it takes one for every fourth frame, up to three times as many as in training:
-/// further views improve its renderings (models/rooms/README.md).
-///
-/// # Errors
-/// Those of counting the frames.
-pub fn default_num_context(
-    model: &ModelConfig,
-    trained: usize,
-    source: &dyn SceneSource,
-    scene: usize,
-) -> Result<usize, DataError> {
-    if model.camera_encoding == CameraEncoding::Plucker {
-        return Ok(trained);
+/// The context views of a scene, and which of them are encoded together.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ContextChoice {
+    /// These frames, encoded together.
+    Frames(Vec<usize>),
+    /// A number of frames at equal distances along the camera path, or all frames of a shorter path, encoded together.
+    Spread(usize),
+    /// A frame and those nearest to it, encoded together.
+    Near {
+        /// The frame.
+        frame: usize,
+        /// Number of views with the frame.
+        num_views: usize,
+    },
+    /// All frames, of a long path 128, in overlapping groups of neighbours.
+    Neighbours {
+        /// Views of a group.
+        num_views: usize,
+        /// Number of groups; `None` for three for every four views. There are more where these leave a view out.
+        num_groups: Option<usize>,
+    },
+}
+
+impl ContextChoice {
+    /// Returns the default for a captured scene and a network that was trained with up to `num_views` views: groups of
+    /// neighbours with camera-relative attention, to which it does not matter where the origin is; else views along the path.
+    pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
+        if model.camera_encoding == CameraEncoding::Plucker || !model.has_patch_tokens() {
+            return Self::Spread(num_views);
+        }
+        Self::Neighbours { num_views, num_groups: None }
     }
-    Ok((source.num_frames(scene)? / 4).clamp(trained, 3 * trained))
 }
 
-/// Chooses `num_views` context frames of a scene, or all its frames if it has fewer, at equal distances along the camera
-/// path, as [`encode`](crate::encode) does without [`EncodeOptions::context`](crate::EncodeOptions::context).
-///
-/// # Errors
-/// Those of the cameras, and [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
-pub fn spread_contexts(reader: &ClipReader, scene: usize, num_views: usize) -> Result<Vec<usize>, SceneError> {
-    let (context, _) = contexts(reader, scene, None, num_views)?;
-    Ok(context)
+/// The context views of a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Contexts {
+    /// Frames of the scene.
+    pub frames: Vec<usize>,
+    /// Groups of views that are encoded together, as positions in `frames`.
+    pub groups: Vec<Vec<usize>>,
+    /// The frame of their poses.
+    pub normalization: PoseNormalization,
 }
 
-/// Returns the context frames of a scene and the frame of its poses.
-pub(crate) fn contexts(
-    reader: &ClipReader,
-    scene: usize,
-    requested: Option<&[usize]>,
-    num_views: usize,
-) -> Result<(Vec<usize>, PoseNormalization), SceneError> {
-    let (key, data) = (reader.source.key(scene), &reader.options);
-    let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
-    let frames = context_frames(&poses, requested, num_views)?;
-    let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-    let normalization = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)
-        .map_err(DataError::from)?;
-    Ok((frames, normalization))
+impl Contexts {
+    /// Returns the context views that [`encode`](crate::encode) chooses: none of every `hold_out` frames, 0 for all frames.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] for frames that the scene does not have, those of the cameras, and
+    /// [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
+    pub fn choose(
+        reader: &ClipReader,
+        scene: usize,
+        choice: &ContextChoice,
+        hold_out: usize,
+    ) -> Result<Self, SceneError> {
+        let (key, data) = (reader.source.key(scene), &reader.options);
+        let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
+        let frames = choose_frames(&poses, choice, hold_out)?;
+        let context: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
+        let groups = match *choice {
+            ContextChoice::Neighbours { num_views, num_groups } => {
+                let default = (GROUPS_PER_VIEW * frames.len() as f64).ceil() as usize;
+                neighbour_groups(&context, num_views, num_groups.unwrap_or(default))
+            }
+            _ => vec![(0..frames.len()).collect()],
+        };
+        let normalization = PoseNormalization::find(key, &context, &[], data.pose_rotation, data.pose_scale)
+            .map_err(DataError::from)?;
+        Ok(Self { frames, groups, normalization })
+    }
+
+    /// Returns the number of members of all groups.
+    pub fn num_members(&self) -> usize {
+        self.groups.iter().map(Vec::len).sum()
+    }
 }
 
-/// Checks the requested context frames, or chooses `num_views` frames along the camera path.
-fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, SceneError> {
+/// Chooses frames of a scene that are not held out, or checks those of the choice.
+fn choose_frames(poses: &[Pose], choice: &ContextChoice, hold_out: usize) -> Result<Vec<usize>, SceneError> {
     let num_frames = poses.len();
-    let bad = |value: String, fix: String| ModelError::BadConfig { key: "--context", value, fix }.into();
-    let Some(requested) = requested else {
-        return contexts_along_path(poses, num_views.min(num_frames)).ok_or_else(|| {
-            bad(num_views.to_string(), format!("the scene has {num_frames} frames; list the frames to use"))
-        });
+    let kept: Vec<usize> = (0..num_frames).filter(|&frame| !is_held_out(frame, hold_out)).collect();
+    let kept_poses: Vec<Pose> = kept.iter().map(|&frame| poses[frame]).collect();
+    let spread = |num_views: usize| {
+        contexts_along_path(&kept_poses, num_views.min(kept.len())).ok_or_else(|| {
+            bad(
+                "--context",
+                num_views.to_string(),
+                format!("the scene has {num_frames} frames; list the frames to use"),
+            )
+        })
     };
-    let list = requested.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
-    let mut sorted = requested.to_vec();
-    sorted.sort_unstable();
-    sorted.dedup();
-    if requested.len() < 2 || sorted.len() < requested.len() {
-        return Err(bad(list, "write at least two frames, each once".into()));
-    }
-    if let Some(frame) = requested.iter().find(|frame| **frame >= num_frames) {
-        let last = num_frames.saturating_sub(1);
-        return Err(bad(list, format!("there is no frame {frame}; the scene has frames 0 to {last}")));
-    }
-    Ok(requested.to_vec())
+    let no_frame =
+        |frame| format!("there is no frame {frame}; the scene has frames 0 to {}", num_frames.saturating_sub(1));
+    let positions = match *choice {
+        ContextChoice::Frames(ref frames) => {
+            let list = frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+            let mut sorted = frames.clone();
+            sorted.sort_unstable();
+            sorted.dedup();
+            if frames.len() < 2 || sorted.len() < frames.len() {
+                return Err(bad("--context", list, "write at least two frames, each once".into()));
+            }
+            return match frames.iter().find(|frame| **frame >= num_frames) {
+                Some(&frame) => Err(bad("--context", list, no_frame(frame))),
+                None => Ok(frames.clone()),
+            };
+        }
+        ContextChoice::Near { frame, num_views } => {
+            let Some(position) = kept.iter().position(|&other| other == frame) else {
+                let fix = if frame < num_frames { "the frame is held out".into() } else { no_frame(frame) };
+                return Err(bad("--near", frame.to_string(), fix));
+            };
+            nearest_views(&kept_poses, &ViewDistance::new(&kept_poses), position, num_views)
+        }
+        ContextChoice::Spread(num_views) => spread(num_views)?,
+        ContextChoice::Neighbours { .. } => spread(MAX_VIEWS)?,
+    };
+    Ok(positions.into_iter().map(|position| kept[position]).collect())
 }
 
-/// Returns the largest angle between the directions of two cameras, in degrees.
-pub(crate) fn widest_turn_deg(cameras: &[Camera]) -> f64 {
-    let axes: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.rotation.z_axis).collect();
-    let least = axes.iter().flat_map(|a| axes.iter().map(|b| a.dot(*b))).fold(1.0, f64::min);
-    least.max(-1.0).acos().to_degrees()
+fn bad(key: &'static str, value: String, fix: String) -> SceneError {
+    ModelError::BadConfig { key, value, fix }.into()
 }
 
 #[cfg(test)]
 mod tests {
-    use clift_core::{DMat3, Intrinsics};
-
     use super::*;
 
     #[test]
-    fn context_frames_are_checked_or_spread() {
+    fn context_frames_are_checked_spread_or_neighbours() {
         let at = |x: f64| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY };
         let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
-        assert_eq!(context_frames(&poses, None, 4).unwrap(), [0, 3, 6, 9]);
-        assert_eq!(context_frames(&poses[..3], None, 4).unwrap(), [0, 1, 2]);
-        assert_eq!(context_frames(&poses, Some(&[7, 2]), 4).unwrap(), [7, 2]);
-        let message = |frames: &[usize]| context_frames(&poses, Some(frames), 4).unwrap_err().to_string();
+        let frames = |choice: ContextChoice| choose_frames(&poses, &choice, 0).map_err(|error| error.to_string());
+        assert_eq!(frames(ContextChoice::Spread(4)).unwrap(), [0, 3, 6, 9]);
+        assert_eq!(choose_frames(&poses[..3], &ContextChoice::Spread(4), 0).unwrap(), [0, 1, 2]);
+        assert_eq!(frames(ContextChoice::Frames(vec![7, 2])).unwrap(), [7, 2]);
+        assert_eq!(frames(ContextChoice::Near { frame: 8, num_views: 3 }).unwrap(), [7, 8, 9]);
+        let all = ContextChoice::Neighbours { num_views: 4, num_groups: None };
+        assert_eq!(frames(all).unwrap(), (0..10).collect::<Vec<_>>());
+        assert_eq!(choose_frames(&poses, &ContextChoice::Spread(9), 4).unwrap(), [1, 2, 3, 5, 6, 7, 9]);
+        let near = frames(ContextChoice::Near { frame: 12, num_views: 3 }).unwrap_err();
+        assert_eq!(near, "`--near` = 12: there is no frame 12; the scene has frames 0 to 9");
+        let message = |list: &[usize]| frames(ContextChoice::Frames(list.to_vec())).unwrap_err();
         assert_eq!(message(&[0, 10]), "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9");
         assert_eq!(message(&[3, 3]), "`--context` = 3,3: write at least two frames, each once");
         assert_eq!(message(&[3]), "`--context` = 3: write at least two frames, each once");
-    }
-
-    #[test]
-    fn the_widest_turn_is_between_any_two_cameras() {
-        let camera = |yaw_deg: f64| Camera {
-            c2w: Pose { rotation: DMat3::from_rotation_y(yaw_deg.to_radians()), ..Pose::IDENTITY },
-            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 },
-        };
-        assert!((widest_turn_deg(&[camera(-30.0), camera(0.0), camera(120.0)]) - 150.0).abs() < 1e-9);
-        assert!(widest_turn_deg(&[camera(20.0)]) < 1e-5);
     }
 }

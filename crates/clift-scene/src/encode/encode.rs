@@ -1,22 +1,22 @@
 //! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
-use clift_core::derive_seed;
+use clift_core::{ClipViews, derive_seed};
 use clift_data::{ClipReader, ViewIndices, ViewSampler};
 use clift_model::{Clusters, Grouping, KMeans, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
 
-use crate::encode::contexts::contexts;
+use crate::encode::contexts::{ContextChoice, Contexts};
 use crate::error::SceneError;
 use crate::scene::scene::Scene;
 
 /// Settings of [`encode`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct EncodeOptions {
-    /// Context frames; `None` for `num_context` frames along the camera path.
-    pub context: Option<Vec<usize>>,
-    /// Number of context views without `context`, such as the number in training.
-    pub num_context: usize,
-    /// Number of stored tokens; `None` for a quarter, or all tokens of a network without clusters.
+    /// Context views and their groups.
+    pub context: ContextChoice,
+    /// One of this many frames is not a context view, 0 for none.
+    pub hold_out: usize,
+    /// Number of stored tokens of all groups; `None` for a quarter, or all tokens of a network without clusters.
     pub stored_tokens: Option<TokenCount>,
     /// Token groups that the model was trained on.
     pub grouping: Grouping,
@@ -32,8 +32,8 @@ impl Default for EncodeOptions {
     /// The options for the default config of a run.
     fn default() -> Self {
         Self {
-            context: None,
-            num_context: ViewSampler::default().max_context,
+            context: ContextChoice::Spread(ViewSampler::default().max_context),
+            hold_out: 0,
             stored_tokens: None,
             grouping: Grouping::default(),
             kmeans: KMeans::default(),
@@ -76,11 +76,12 @@ impl EncodedScene {
     }
 }
 
-/// Encodes a scene of `reader`. The groups equal those of `clift eval` for the same contexts and count.
+/// Encodes a scene of `reader`. The clusters of a single group equal those of `clift eval` for the same contexts and count.
 ///
 /// # Errors
 /// [`ModelError::BadConfig`] for frames that the scene does not have, [`ModelError::BadTokenCount`] for a count above the
-/// number of tokens, [`ModelError::BadConfig`] for fewer tokens than all of a network without clusters, and the errors of reading the images.
+/// number of tokens or below the number of groups, [`ModelError::BadConfig`] for fewer tokens than all of a network without
+/// clusters, and the errors of reading the images.
 pub fn encode(
     model: &TrainedModel,
     reader: &ClipReader,
@@ -88,42 +89,32 @@ pub fn encode(
     options: &EncodeOptions,
 ) -> Result<EncodedScene, SceneError> {
     let (key, data) = (reader.source.key(scene), &reader.options);
-    let (context, frame) = contexts(reader, scene, options.context.as_deref(), options.num_context)?;
-    let views = ViewIndices { context, target: Vec::new() };
+    let Contexts { frames, groups, normalization } =
+        Contexts::choose(reader, scene, &options.context, options.hold_out)?;
+    let views = ViewIndices { context: frames, target: Vec::new() };
     let clip = reader.read(scene, &views)?;
-
-    let lift = model.network.encode(&Views::upload(&[&clip.context], &model.device)?); // [1, N, D]
-    let [_, num_lift_tokens, dim] = lift.dims();
+    let sizes: Vec<usize> = groups.iter().map(Vec::len).collect();
+    let counts = token_counts(model, [data.height, data.width], &sizes, options.stored_tokens)?;
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
-    let architecture = model.config.architecture;
-    let clusters = if architecture.supports_clusters() {
-        let grid = [data.height, data.width].map(|side| side / model.config.patch_size);
-        let count = options.stored_tokens.unwrap_or(TokenCount::Share(0.25));
-        let (count, kmeans) = (count.of(num_lift_tokens)?, (&options.kmeans, seed));
-        options.grouping.group(count, (clip.context.num_views(), grid), kmeans, || lift.values.clone())?
-    } else {
-        if let Some(count) = options.stored_tokens
-            && count.of(num_lift_tokens)? != num_lift_tokens
-        {
-            let fix = format!(
-                "a scene of {architecture} is all its tokens, which are not clustered: write {num_lift_tokens}"
-            );
-            return Err(ModelError::BadConfig { key: "--stored-tokens", value: count.to_string(), fix }.into());
-        }
-        SceneClusters::identity(num_lift_tokens)
+
+    let (mut tokens, mut lift) = (Vec::new(), Vec::new());
+    let (mut assignment, mut token_ids) = (Vec::new(), Vec::new());
+    for (group, count) in groups.iter().zip(counts) {
+        let encoded = encode_group(model, &members(&clip.context, group), count, options, seed)?;
+        // Tokens and patches are counted over all groups.
+        let (first_cluster, first_patch) = (token_ids.len() as u32, assignment.len() as u32);
+        assignment.extend(encoded.clusters.assignment().iter().map(|&cluster| first_cluster + cluster));
+        token_ids.extend(encoded.clusters.centroid_index().iter().map(|&patch| first_patch + patch));
+        tokens.extend(encoded.tokens);
+        lift.extend(encoded.lift);
+    }
+    let clusters = SceneClusters::new(assignment, token_ids.clone())?;
+    debug_assert_eq!(tokens.len(), token_ids.len() * model.config.dim, "a row per centroid");
+    let kind = match (model.config.architecture.supports_clusters(), model.has_condenser) {
+        (false, _) => TokenKind::All,
+        (true, true) => TokenKind::Clift,
+        (true, false) => TokenKind::Kmeans,
     };
-    let cluster_error = clusters.variance_within(&lift.to_host()?);
-    let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
-    let (kind, tokens) = if !architecture.supports_clusters() {
-        (TokenKind::All, lift)
-    } else if model.has_condenser {
-        (TokenKind::Clift, model.network.compress(lift, &index))
-    } else {
-        (TokenKind::Kmeans, lift.centroids(&index))
-    };
-    let tokens = tokens.to_host()?;
-    let token_ids = clusters.centroid_index().to_vec();
-    debug_assert_eq!(tokens.len(), token_ids.len() * dim, "a row per centroid");
     let scene = Scene {
         key: key.into(),
         kind,
@@ -134,9 +125,95 @@ pub fn encode(
         width: data.width,
         context: clip.context.cameras,
         context_frames: views.context.iter().map(|&frame| frame as u32).collect(),
-        world: frame,
+        groups: groups.iter().map(|group| group.iter().map(|&view| view as u32).collect()).collect(),
+        world: normalization,
         token_ids,
         tokens,
     };
-    Ok(EncodedScene { scene, num_lift_tokens, cluster_error, clusters })
+    let cluster_error = clusters.variance_within(&lift);
+    Ok(EncodedScene { scene, num_lift_tokens: clusters.assignment().len(), cluster_error, clusters })
+}
+
+/// Returns the number of stored tokens of every group of `sizes` views: a share of its tokens, or an equal part of a number.
+fn token_counts(
+    model: &TrainedModel,
+    [height, width]: [usize; 2],
+    sizes: &[usize],
+    stored_tokens: Option<TokenCount>,
+) -> Result<Vec<usize>, ModelError> {
+    let architecture = model.config.architecture;
+    let all: Vec<usize> =
+        sizes.iter().map(|&views| model.config.num_tokens(views, height, width)).collect::<Result<_, _>>()?;
+    let sum: usize = all.iter().sum();
+    if !architecture.supports_clusters() {
+        return match stored_tokens {
+            Some(count) if count.of(sum)? != sum => {
+                let fix = format!("a scene of {architecture} is all its tokens, which are not clustered: write {sum}");
+                Err(ModelError::BadConfig { key: "--stored-tokens", value: count.to_string(), fix })
+            }
+            _ => Ok(all),
+        };
+    }
+    match stored_tokens.unwrap_or(TokenCount::Share(0.25)) {
+        share @ TokenCount::Share(_) => all.iter().map(|&all| share.of(all)).collect(),
+        count @ TokenCount::Count(_) => {
+            let (count, groups) = (count.of(sum)?, sizes.len());
+            if count < groups {
+                return Err(ModelError::BadTokenCount {
+                    text: count.to_string(),
+                    reason: format!(
+                        "the scene has {groups} groups of views; write at least as many, or fewer --groups"
+                    ),
+                });
+            }
+            let parts = (0..groups).map(|group| (count + group) / groups);
+            Ok(parts.zip(all).map(|(part, all)| part.min(all)).collect())
+        }
+    }
+}
+
+/// Tokens and clusters of views that were encoded together.
+struct EncodedGroup {
+    /// Stored tokens, `[S, D]`.
+    tokens: Vec<f32>,
+    /// Encoder tokens, `[N, D]`.
+    lift: Vec<f32>,
+    clusters: SceneClusters,
+}
+
+fn encode_group(
+    model: &TrainedModel,
+    views: &ClipViews,
+    count: usize,
+    options: &EncodeOptions,
+    seed: u64,
+) -> Result<EncodedGroup, SceneError> {
+    let lift = model.network.encode(&Views::upload(&[views], &model.device)?); // [1, N, D]
+    let lift_values = lift.to_host()?;
+    let supports_clusters = model.config.architecture.supports_clusters();
+    let clusters = if supports_clusters {
+        let grid = [views.height, views.width].map(|side| side / model.config.patch_size);
+        let kmeans = (&options.kmeans, seed);
+        options.grouping.group(count, (views.num_views(), grid), kmeans, || lift.values.clone())?
+    } else {
+        SceneClusters::identity(count)
+    };
+    let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
+    let tokens = match (supports_clusters, model.has_condenser) {
+        (false, _) => lift,
+        (true, true) => model.network.compress(lift, &index),
+        (true, false) => lift.centroids(&index),
+    };
+    Ok(EncodedGroup { tokens: tokens.to_host()?, lift: lift_values, clusters })
+}
+
+/// Returns the views of a group.
+fn members(views: &ClipViews, group: &[usize]) -> ClipViews {
+    let len = views.height * views.width * 3;
+    ClipViews {
+        images: group.iter().flat_map(|&view| &views.images[view * len..][..len]).copied().collect(),
+        cameras: group.iter().map(|&view| views.cameras[view]).collect(),
+        frame_index: group.iter().map(|&view| views.frame_index[view]).collect(),
+        ..*views
+    }
 }

@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use clift_data::ClipReader;
+use clift_data::{ClipReader, is_held_out};
 use clift_model::TrainedModel;
 
-use crate::check::held_out_frame::HeldOutFrame;
+use crate::check::view_check::CheckedView;
 use crate::encode::coding::{Coder, Coding};
-use crate::encode::contexts::widest_turn_deg;
+use crate::encode::contexts::Contexts;
 use crate::encode::encode::{EncodeOptions, EncodedScene, encode};
 use crate::error::SceneError;
 use crate::fit::step_choice::{expected_step, step_for_bytes, step_for_loss};
@@ -36,14 +36,16 @@ pub struct WrittenScene {
     pub file_bytes: u64,
     /// File name of every frame; empty for frames without files.
     pub frame_names: Vec<String>,
-    /// Largest angle between the directions of two context views, in degrees; see [`MAX_TURN_DEG`](crate::MAX_TURN_DEG).
-    pub turn_deg: f64,
+    /// Number of frames of the scene.
+    pub num_frames: usize,
     /// Width and height of the images in pixels.
     pub image_size: [usize; 2],
     /// Width and height of the central part of the images that is used; `None` if that is nearly all.
     pub cropped: Option<[usize; 2]>,
-    /// A frame that is not a context view, rendered; `None` if no other frame can be read.
-    pub held_out: Option<HeldOutFrame>,
+    /// The context views, rendered.
+    pub contexts: Vec<CheckedView>,
+    /// Frames that are not context views, rendered: those held out, or one; none if no other frame can be read.
+    pub others: Vec<CheckedView>,
 }
 
 impl WrittenScene {
@@ -53,7 +55,7 @@ impl WrittenScene {
     }
 }
 
-/// Encodes scene `index` of `reader`, writes its file and renders a frame that is not a context view.
+/// Encodes scene `index` of `reader`, writes its file, and compares renderings of it with the photos.
 ///
 /// # Errors
 /// As [`encode`], [`ModelError::NoCodec`](clift_model::ModelError::NoCodec) without a codec that the coding needs,
@@ -66,22 +68,28 @@ pub fn encode_scene(
 ) -> Result<WrittenScene, SceneError> {
     let frame_names = reader.source.frame_names(index)?;
     let coder = Coder::new(options.coding, &options.weights, model)?;
-    let num_views = options.encode.context.as_ref().map_or(options.encode.num_context, Vec::len);
-    let best = coder.best_count(num_views, [reader.options.height, reader.options.width], &options.encode.model_path);
+    let contexts = Contexts::choose(reader, index, &options.encode.context, options.encode.hold_out)?;
+    let size = [reader.options.height, reader.options.width];
+    let best = coder.best_count(&contexts, size, &options.encode.model_path);
     let stored_tokens = options.encode.stored_tokens.or(best);
     let encode_options = EncodeOptions { stored_tokens, ..options.encode.clone() };
     let mut encoded = encode(model, reader, index, &encode_options)?;
     let stored = write(&coder, &mut encoded, options, (model, reader, index))?;
     let scene = &encoded.scene;
+    let num_frames = reader.source.num_frames(index)?;
+    let is_context = |frame: &usize| scene.context_frames.contains(&(*frame as u32));
+    let held_out: Vec<usize> =
+        (0..num_frames).filter(|&frame| is_held_out(frame, options.encode.hold_out) && !is_context(&frame)).collect();
     let image_size = reader.source.image_size(index, scene.context_frames[0] as usize)?;
     Ok(WrittenScene {
         stored,
         file_bytes: std::fs::metadata(&options.out).map_or(0, |file| file.len()),
         frame_names,
-        turn_deg: widest_turn_deg(&scene.context),
+        num_frames,
         image_size,
         cropped: cropped(image_size, [scene.width, scene.height]),
-        held_out: HeldOutFrame::render(model, reader, index, scene)?,
+        contexts: CheckedView::contexts(model, (reader, index), scene)?,
+        others: CheckedView::other_frames(model, (reader, index), scene, &held_out)?,
         encoded,
     })
 }

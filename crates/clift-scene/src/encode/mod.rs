@@ -1,7 +1,7 @@
 //! Encoding of captured images, up to the scene file.
 //!
 //! - `names`: scenes by key, frames by position or file name
-//! - `contexts`: the context views, their default number, their directions
+//! - `contexts`: the context views, by default groups of neighbours (`groups`), and their directions
 //! - `encode`: tokens, clusters, condenser
 //! - `cluster_map`: the clusters for a JSON file
 //! - `coding`: how the file stores the tokens
@@ -12,4 +12,5 @@ pub(crate) mod coding;
 pub(crate) mod contexts;
 pub(crate) mod encode;
 pub(crate) mod encode_scene;
+pub(crate) mod groups;
 pub(crate) mod names;

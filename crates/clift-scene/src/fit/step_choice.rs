@@ -3,7 +3,7 @@
 use clift_data::ClipReader;
 use clift_model::{ModelError, TrainedModel};
 
-use crate::check::held_out_frame::{CheckViews, render_scene};
+use crate::check::view_check::{CheckViews, render_scene};
 use crate::codec::token_codec::TokenCodec;
 use crate::error::SceneError;
 use crate::fit::fit::{loss, view_errors};
@@ -95,6 +95,6 @@ pub fn expected_step(scene: &Scene, codec: &TokenCodec, loss_db: f64) -> Result<
 
 /// Returns the stored share of all tokens.
 fn share(scene: &Scene) -> Result<f64, SceneError> {
-    let all = scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?;
+    let all = scene.model.num_tokens(scene.num_members(), scene.height, scene.width)?;
     Ok(scene.num_tokens() as f64 / all as f64)
 }

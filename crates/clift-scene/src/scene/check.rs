@@ -46,17 +46,32 @@ impl Scene {
                 "{views} context cameras and {frames} frame numbers, expected equal numbers from 1 to {MAX_VIEWS}"
             ));
         }
+        self.check_groups()?;
         if self.height.max(self.width) > MAX_SIDE_PX {
             return Err(format!(
                 "context views of {} x {} pixels, expected at most {MAX_SIDE_PX} a side",
                 self.width, self.height
             ));
         }
-        let num_patches = self.model.num_patches(views, self.height, self.width).map_err(|error| error.to_string())?;
+        let num_patches =
+            self.model.num_patches(self.num_members(), self.height, self.width).map_err(|error| error.to_string())?;
         if num_patches > MAX_PATCHES {
             return Err(format!("{num_patches} patches of context views, expected at most {MAX_PATCHES}"));
         }
         Ok(num_patches)
+    }
+
+    fn check_groups(&self) -> Result<(), String> {
+        if self.groups.is_empty() || self.groups.iter().any(Vec::is_empty) || self.groups.len() > MAX_VIEWS {
+            return Err(format!("{} groups of context views, expected 1 to {MAX_VIEWS} with views", self.groups.len()));
+        }
+        if let Some(view) = self.groups.iter().flatten().find(|view| **view as usize >= self.context.len()) {
+            return Err(format!("a group of context view {view}, expected less than {}", self.context.len()));
+        }
+        if self.groups.len() > 1 && !self.model.has_patch_tokens() {
+            return Err(format!("{} groups of learned tokens, expected one", self.groups.len()));
+        }
+        Ok(())
     }
 
     fn check_tokens(&self, num_patches: usize) -> Result<(), String> {

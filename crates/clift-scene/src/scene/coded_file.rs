@@ -1,4 +1,4 @@
-//! Version 5 of the scene file: coded tokens.
+//! The scene file with coded tokens.
 //!
 //! | part | type |
 //! |---|---|
@@ -9,10 +9,12 @@
 //! | number of intrinsics: 1 if the views have the same, else that of the views | u32 |
 //! | for each of them: `fx, fy, cx, cy` in pixels | 4 x f32 |
 //! | for each context view: quaternion `x, y, z, w` and center of the pose, frame number | 7 x f32, u32 |
+//! | number of groups, their sizes, and the context views of the groups, one group after the other | u16 |
+//! | zero or two bytes 0, up to a multiple of four bytes | |
 //! | words of the entropy coder: token ids, then levels by direction | u32 |
 //! | CRC-32 of everything before | u32 |
 //!
-//! `__metadata__` holds strings: `format` = `clift-scene`, `version` = `5`, `key`, `codec` (hash of the model's codec),
+//! `__metadata__` holds strings: `format` = `clift-scene`, `version` = `7`, `key`, `codec` (hash of the model's codec),
 //! `model_path`, `views` (number, height and width, as `4x64x64`) and `tokens` (their number). Everything else is in the
 //! codec, see [`TokenCodec`]. `docs/reference/files.md` describes how tokens are decoded.
 // N patches of the context views, S tokens, V context views
@@ -25,7 +27,7 @@ use clift_model::{ModelConfig, ModelError};
 
 use crate::codec::prediction::Places;
 use crate::codec::token_codec::TokenCodec;
-use crate::scene::coded_views::{read_views, read_world, write_views, write_world};
+use crate::scene::coded_views::{read_groups, read_views, read_world, write_groups, write_views, write_world};
 use crate::scene::header::{COPY_AGAIN, Fields, GIVE_MODEL, Refusal, refusal, write_fields};
 use crate::scene::scene::{CODED_VERSION, FORMAT, Scene};
 use crate::scene::token_coding::{CodedLoss, TokenCoding};
@@ -47,6 +49,7 @@ impl Scene {
         let mut body = step.to_le_bytes().to_vec();
         write_world(&self.world, &mut body);
         write_views(&self.context, &self.context_frames, &mut body);
+        write_groups(&self.groups, &mut body);
         body.extend(words.iter().flat_map(|word| word.to_le_bytes()));
         let length = body.len() + 4;
 
@@ -80,7 +83,7 @@ impl Scene {
     /// Returns the patches of the tokens. Sides of views are multiples of the patch, which is checked elsewhere.
     fn places(&self) -> Places<'_> {
         let [rows, columns] = [self.height, self.width].map(|side| side / self.model.patch_size);
-        Places { ids: &self.token_ids, grid: [self.context.len(), rows, columns] }
+        Places { ids: &self.token_ids, grid: [self.num_members(), rows, columns] }
     }
 
     /// Writes the scene with coded tokens, as [`write`](Self::write) writes plain ones.
@@ -118,10 +121,11 @@ pub(crate) fn from_coded_bytes(
     let split = || {
         let (step, rest) = body[..body.len().saturating_sub(4)].split_first_chunk::<4>()?;
         let (world, rest) = read_world(rest)?;
-        let (views, words) = read_views(views, rest)?;
-        (words.len() % 4 == 0).then_some((f32::from_le_bytes(*step), world, views, words))
+        let (views, rest) = read_views(views, rest)?;
+        let (groups, words) = read_groups(rest)?;
+        (words.len() % 4 == 0).then_some((f32::from_le_bytes(*step), world, views, groups, words))
     };
-    let Some((step, world, (context, context_frames), words)) = split() else {
+    let Some((step, world, (context, context_frames), groups, words)) = split() else {
         return Err(format!("{} bytes of {views} views and coded tokens", body.len()).into());
     };
     let words = words.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect();
@@ -135,6 +139,7 @@ pub(crate) fn from_coded_bytes(
         width,
         context,
         context_frames,
+        groups,
         world,
         token_ids: Vec::new(),
         tokens: Vec::new(),

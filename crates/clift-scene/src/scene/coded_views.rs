@@ -1,8 +1,10 @@
-//! Normalization and context views of a coded scene file.
+//! Normalization, context views and groups of a coded scene file.
 // V context views
 
 use clift_core::{Camera, DMat3, Pose, PoseNormalization};
 use glam::DQuat;
+
+use crate::scene::read::split_groups;
 
 /// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
 const WORLD_BYTES: usize = 4 * 4 + 4 * 8;
@@ -57,6 +59,29 @@ pub(crate) fn read_views(views: usize, bytes: &[u8]) -> Option<(Views, &[u8])> {
         (Camera { c2w, intrinsics: intrinsics[i.min(count - 1)].into() }, frame)
     };
     Some((bytes.chunks_exact(VIEW_BYTES).enumerate().map(view).unzip(), rest))
+}
+
+/// Adds the number of groups, their sizes and their views, padded to words of four bytes.
+pub(crate) fn write_groups(groups: &[Vec<u32>], body: &mut Vec<u8>) {
+    let start = body.len();
+    let sizes = groups.iter().map(|group| group.len() as u32);
+    let numbers = std::iter::once(groups.len() as u32).chain(sizes).chain(groups.concat());
+    body.extend(numbers.flat_map(|number| (number as u16).to_le_bytes()));
+    body.resize(start + (body.len() - start).next_multiple_of(4), 0);
+}
+
+/// Reads groups; returns them and the rest of the bytes. `None` if there are too few bytes.
+pub(crate) fn read_groups(bytes: &[u8]) -> Option<(Vec<Vec<u32>>, &[u8])> {
+    let numbers = |bytes: &[u8]| -> Vec<u32> {
+        bytes.as_chunks().0.iter().map(|number| u32::from(u16::from_le_bytes(*number))).collect()
+    };
+    let (count, rest) = bytes.split_first_chunk::<2>()?;
+    let (sizes, rest) = rest.split_at_checked(2 * usize::from(u16::from_le_bytes(*count)))?;
+    let sizes = numbers(sizes);
+    let members: usize = sizes.iter().map(|&size| size as usize).sum();
+    let (views, _) = rest.split_at_checked(2 * members)?;
+    let end = (2 * (1 + sizes.len() + members)).next_multiple_of(4);
+    Some((split_groups(&sizes, &numbers(views)).ok()?, bytes.get(end..)?))
 }
 
 /// Returns the pose of a quaternion and a center. That of damaged numbers contains NaN, which the check of the scene finds.

@@ -15,7 +15,7 @@ use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
 use crate::tensors::Tensors;
 
-/// Longest accepted header; headers of version 2 have 2048 bytes.
+/// Longest accepted header; those of `HEADER_BYTES` are written.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
 /// Largest accepted file: 65,536 tokens of width 768 in f32 take a fifth of it.
 const MAX_FILE_BYTES: u64 = 1 << 30;
@@ -23,8 +23,8 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 const RAY_TOLERANCE: f64 = 1e-4;
 
 const GIVE_ANOTHER: &str = "give a file that `clift encode` wrote";
-const OTHER_VERSION: &str = "encode the scene again, or render it with the clift that wrote it, for versions 1, 3 and 4 \
-                             commit da4454f8 or earlier";
+const OTHER_VERSION: &str = "encode the scene again, or render it with the clift that wrote it, for versions 1 to 5 \
+                             commit 51232770 or earlier";
 
 impl Scene {
     /// Reads and checks a scene file. Coded tokens need the codec of the scene's model, see [`find_model`](Self::find_model).
@@ -106,6 +106,8 @@ fn from_bytes(
     let tensors = Tensors(file);
     let (format, num_tokens, tokens) = tensors.tokens(&model)?;
     let views = tensors.length("context_frames")?;
+    let indices = |name| tensors.u32s(name, &[tensors.length(name)?]);
+    let groups = split_groups(&indices("group_sizes")?, &indices("group_views")?)?;
     let poses = tensors.f64s("context_c2w", &[views, 4, 4])?;
     let intrinsics = tensors.f64s("context_intrinsics", &[views, 4])?;
     let cameras = poses.as_chunks().0.iter().zip(intrinsics.as_chunks::<4>().0).enumerate();
@@ -125,6 +127,7 @@ fn from_bytes(
         width: fields.count("width")?,
         context: cameras.collect::<Result<_, String>>()?,
         context_frames: tensors.u32s("context_frames", &[views])?,
+        groups,
         world: PoseNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
         token_ids: if model.has_patch_tokens() {
             tensors.u32s("token_ids", &[num_tokens])?
@@ -139,6 +142,23 @@ fn from_bytes(
         check_rays(&scene, &tensors.f32s("token_rays", &[num_tokens, 6])?)?;
     }
     Ok((scene, format.into()))
+}
+
+/// Splits the members of all groups by the sizes of the groups.
+pub(crate) fn split_groups(sizes: &[u32], members: &[u32]) -> Result<Vec<Vec<u32>>, String> {
+    let mut rest = members;
+    let mut groups = Vec::with_capacity(sizes.len());
+    for (group, &size) in sizes.iter().enumerate() {
+        let Some((views, others)) = rest.split_at_checked(size as usize) else {
+            return Err(format!("group {group} has {size} views, {} are left of {}", rest.len(), members.len()));
+        };
+        groups.push(views.to_vec());
+        rest = others;
+    }
+    if !rest.is_empty() {
+        return Err(format!("{} views after the last group", rest.len()));
+    }
+    Ok(groups)
 }
 
 /// Checks the length of the header before the header is parsed.
@@ -179,7 +199,7 @@ impl Tensors<'_> {
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));
         let format = format.ok_or_else(|| format!("`tokens` is {dtype:?}, expected F32, F16 or I8"))?;
         let places = if model.has_patch_tokens() { 2 } else { 0 };
-        let expected = 6 + places + usize::from(format == TokenFormat::Int8);
+        let expected = 8 + places + usize::from(format == TokenFormat::Int8);
         if self.0.len() != expected {
             return Err(format!("{} tensors, expected {expected}", self.0.len()));
         }

@@ -34,7 +34,7 @@ impl RenderBudget {
         height: usize,
         width: usize,
     ) -> Result<Self, ModelError> {
-        let num_storage_tokens = renderer.num_storage_tokens();
+        let num_storage_tokens = renderer.max_render_tokens();
         let mut counts: Vec<usize> = SIXTEENTHS
             .iter()
             .map(|part| (num_storage_tokens * part / 16).max(1))

@@ -9,17 +9,19 @@
 //! | header: JSON with spaces up to [`HEADER_BYTES`] | | |
 //! | `context_c2w`: normalized poses, camera to world | F64 | `[views, 4, 4]` |
 //! | `context_intrinsics`: `fx, fy, cx, cy` in pixels | F64 | `[views, 4]` |
+//! | `group_sizes`: number of context views of each group that was encoded together | U32 | `[groups]` |
+//! | `group_views`: context views of the groups, one group after the other | U32 | `[members]` |
 //! | `world_mean_c2w`, `world_scale`: the normalization of poses | F64 | `[4, 4]`, `[1]` |
 //! | `token_rays`: `[moment, direction]` through the center of a token's patch, not of learned tokens | F32 | `[tokens, 6]` |
 //! | `token_scales`, with `int8` tokens only | F32 | `[tokens]` |
 //! | `context_frames`: frame number of each view in the capture | U32 | `[views]` |
-//! | `token_ids`: patch of the context views of each token, not of learned tokens | U32 | `[tokens]` |
+//! | `token_ids`: patch of the members of all groups of each token, not of learned tokens | U32 | `[tokens]` |
 //! | `tokens` | F32, F16 or I8 | `[tokens, dim]` |
 //!
 //! `__metadata__` holds strings: `format` = `clift-scene`, `version`, `key` of the scene, `kind` of its tokens, `model`
 //! (sizes and variant of the network as JSON), `renderer` (hash of the renderer's weights), `model_path` (path of the model,
 //! relative to the folder of the file or absolute), `height` and `width` of the context views.
-// S storage tokens, V context views, D width
+// S storage tokens, V context views, G groups, M members of all groups, D width
 
 use clift_core::{Camera, PoseNormalization};
 use clift_model::{ModelConfig, TokenKind, TokenRay};
@@ -31,9 +33,9 @@ pub const HEADER_BYTES: usize = 2048;
 
 pub(crate) const FORMAT: &str = "clift-scene";
 /// The version of files with plain tokens.
-pub(crate) const VERSION: &str = "2";
+pub(crate) const VERSION: &str = "6";
 /// The version of files with coded tokens.
-pub(crate) const CODED_VERSION: &str = "5";
+pub(crate) const CODED_VERSION: &str = "7";
 
 /// A compressed scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -57,10 +59,12 @@ pub struct Scene {
     pub context: Vec<Camera>,
     /// Frame number of each context view in the capture.
     pub context_frames: Vec<u32>,
+    /// Groups of context views that were encoded together, as positions in `context`. A view may be a member of several.
+    pub groups: Vec<Vec<u32>>,
     /// Normalization of the poses: its frame has the context cameras.
     pub world: PoseNormalization,
-    /// Patch of each token, `[S]`: `view * rows * columns + row * columns + column`; its index if
-    /// tokens are learned, whose files do not store it.
+    /// Patch of each token, `[S]`: `member * rows * columns + row * columns + column`, where members are counted over all
+    /// groups; its index if tokens are learned, whose files do not store it.
     pub token_ids: Vec<u32>,
     /// Values of the tokens after rounding, `[S, D]`.
     pub tokens: Vec<f32>,
@@ -72,13 +76,46 @@ impl Scene {
         self.token_ids.len()
     }
 
+    /// Returns a single group of all of `num_views` context views.
+    pub fn single_group(num_views: usize) -> Vec<Vec<u32>> {
+        vec![(0..num_views as u32).collect()]
+    }
+
+    /// Returns the cameras of the members of all groups, `[M]`.
+    pub fn members(&self) -> Vec<Camera> {
+        self.groups.iter().flatten().map(|&view| self.context[view as usize]).collect()
+    }
+
+    /// Returns the number of members of all groups.
+    pub fn num_members(&self) -> usize {
+        self.groups.iter().map(Vec::len).sum()
+    }
+
+    /// Returns the positions of every group's tokens, ascending. Learned tokens belong to the only group.
+    pub fn tokens_of_groups(&self) -> Vec<Vec<u32>> {
+        let patches = self.height / self.model.patch_size * (self.width / self.model.patch_size);
+        let of_member: Vec<usize> =
+            self.groups.iter().enumerate().flat_map(|(group, views)| vec![group; views.len()]).collect();
+        let mut tokens = vec![Vec::new(); self.groups.len()];
+        for (token, &id) in self.token_ids.iter().enumerate() {
+            let group = if self.groups.len() == 1 { 0 } else { of_member[id as usize / patches] };
+            tokens[group].push(token as u32);
+        }
+        tokens
+    }
+
+    /// Returns the largest number of tokens of a group, from which a view is rendered.
+    pub fn max_group_tokens(&self) -> usize {
+        self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default()
+    }
+
     /// Returns the ray of every token, through the center of its patch; none of learned tokens.
     ///
     /// # Shapes
     /// - returns `[num_tokens]`, or `[0]`
     pub fn token_rays(&self) -> Vec<TokenRay> {
         let ids = if self.model.has_patch_tokens() { &self.token_ids[..] } else { &[] };
-        TokenRay::of_patches(ids, &self.context, self.height, self.width, self.model.patch_size)
+        TokenRay::of_patches(ids, &self.members(), self.height, self.width, self.model.patch_size)
     }
 
     /// Returns `[moment, direction]` of every token's ray.
@@ -88,21 +125,32 @@ impl Scene {
 
     /// Returns the size of the scene's file in bytes.
     pub fn file_bytes(&self, format: TokenFormat) -> u64 {
-        scene_file_bytes(&self.model, self.num_tokens(), self.context.len(), format)
+        scene_file_bytes(
+            &self.model,
+            self.num_tokens(),
+            (self.context.len(), self.groups.len(), self.num_members()),
+            format,
+        )
     }
 }
 
-/// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + S (28 + D b)` for V context views and S tokens of
-/// width D with b bytes per value, and four more bytes per token for `int8`. Learned tokens have neither ray nor
-/// patch, 28 bytes less.
-pub fn scene_file_bytes(model: &ModelConfig, num_tokens: usize, num_views: usize, format: TokenFormat) -> u64 {
+/// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + 4 G + 4 M + S (28 + D b)` for V context views, G
+/// groups of M members and S tokens of width D with b bytes per value, and four more bytes per token for `int8`. Learned
+/// tokens have neither ray nor patch, 28 bytes less.
+pub fn scene_file_bytes(
+    model: &ModelConfig,
+    num_tokens: usize,
+    (num_views, num_groups, num_members): (usize, usize, usize),
+    format: TokenFormat,
+) -> u64 {
     // Pose and intrinsics in f64, and a frame number.
     let view = (16 + 4) * 8 + 4;
     let world = (16 + 1) * 8;
     // A ray of six f32, and the index of a patch.
     let place = if model.has_patch_tokens() { 6 * 4 + 4 } else { 0 };
     let token = place + format.bytes_per_token(model.dim);
-    (8 + HEADER_BYTES + world + num_views * view + num_tokens * token) as u64
+    let groups = 4 * (num_groups + num_members);
+    (8 + HEADER_BYTES + world + num_views * view + groups + num_tokens * token) as u64
 }
 
 /// Returns the safetensors type of tokens.

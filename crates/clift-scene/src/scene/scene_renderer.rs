@@ -5,9 +5,9 @@ use std::path::Path;
 use std::time::Instant;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use clift_core::Camera;
+use clift_core::{Camera, Pose, ViewDistance};
 use clift_model::{
-    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, Tokens,
+    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, TokenRay, Tokens,
     interleaved, open_renderer, phases, render_bytes, renderer_hash,
 };
 
@@ -29,7 +29,7 @@ pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [heigh
     let grids = model.patch_grids.patches(model.patch_size, size.map(|side| side / model.patch_size));
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
     let num_images = k * k * num_frames;
-    render_bytes(model, scene.num_tokens(), num_images, num_images * largest)
+    render_bytes(model, scene.max_group_tokens(), num_images, num_images * largest)
 }
 
 /// Reads the renderer of a scene from a weight file.
@@ -51,7 +51,7 @@ pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<R
 pub struct RenderedView {
     /// RGB in `(0, 1)`, `[height, width, 3]`.
     pub pixels: Vec<f32>,
-    /// Indices of the selected tokens, ascending; `None` for all tokens.
+    /// Positions of the tokens that it was rendered from, ascending; `None` for all tokens of the scene.
     pub tokens: Option<Vec<u32>>,
     /// Seconds of token selection.
     pub select_s: f64,
@@ -64,14 +64,24 @@ pub struct RenderedView {
 #[derive(Clone, Debug)]
 pub struct SceneRenderer {
     renderer: Renderer,
-    /// Keys and values of all storage tokens.
-    cache: KeyValueCache,
-    selector: Selector,
+    groups: Vec<TokenGroup>,
+    distance: ViewDistance,
     /// Whether tokens have rays, by which a view selects them.
     has_patch_tokens: bool,
     /// Rows of the images that the network was trained on.
     trained_height: usize,
     device: Device,
+}
+
+/// The tokens of context views that were encoded together.
+#[derive(Clone, Debug)]
+struct TokenGroup {
+    views: Vec<Pose>,
+    /// Positions of the tokens in the scene.
+    tokens: Vec<u32>,
+    /// Keys and values of the tokens.
+    cache: KeyValueCache,
+    selector: Selector,
 }
 
 impl SceneRenderer {
@@ -80,19 +90,40 @@ impl SceneRenderer {
     /// # Errors
     /// [`ModelError::BadRay`] for a scene with rays that are not finite; [`Scene::read`] returns no such scene.
     pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
-        let shape = [1, scene.num_tokens(), scene.model.dim];
-        let values = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
-        let context = Cameras::of_views(&scene.context, scene.height, scene.width, device)?;
-        let tokens = Tokens::of_patches(&scene.model, values, &context, &scene.token_ids);
-        let selector = Selector::new(rules, &scene.token_rays())?;
-        let cache = renderer.project_tokens(tokens);
-        let (has_patch_tokens, trained_height) = (scene.model.has_patch_tokens(), scene.height);
-        Ok(Self { renderer, cache, selector, has_patch_tokens, trained_height, device: device.clone() })
+        let (rays, dim) = (scene.token_rays(), scene.model.dim);
+        let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
+        let mut groups = Vec::with_capacity(scene.groups.len());
+        let mut first_patch = 0;
+        for (views, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
+            let rows = tokens.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
+            let values = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, tokens.len(), dim]);
+            let context: Vec<Camera> = views.iter().map(|&view| scene.context[view as usize]).collect();
+            let cameras = Cameras::of_views(&context, scene.height, scene.width, device)?;
+            let patches: Vec<u32> = tokens.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
+            let values = Tensor::from_data(values, device);
+            let rays: Vec<TokenRay> = tokens.iter().filter_map(|&token| rays.get(token as usize)).copied().collect();
+            groups.push(TokenGroup {
+                views: context.iter().map(|camera| camera.c2w).collect(),
+                cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
+                selector: Selector::new(rules, &rays)?,
+                tokens,
+            });
+            first_patch += (views.len() * patches_per_view) as u32;
+        }
+        let context: Vec<Pose> = scene.context.iter().map(|camera| camera.c2w).collect();
+        Ok(Self {
+            renderer,
+            groups,
+            distance: ViewDistance::new(&context),
+            has_patch_tokens: scene.model.has_patch_tokens(),
+            trained_height: scene.height,
+            device: device.clone(),
+        })
     }
 
-    /// Returns the number of the scene's tokens.
-    pub fn num_storage_tokens(&self) -> usize {
-        self.cache.num_tokens()
+    /// Returns the most tokens that a frame is rendered from at once: those of the largest group.
+    pub fn max_render_tokens(&self) -> usize {
+        self.groups.iter().map(|group| group.tokens.len()).max().unwrap_or_default()
     }
 
     /// Returns the number of frames of `width` by `height` pixels that one call renders.
@@ -103,7 +134,7 @@ impl SceneRenderer {
 
     /// Resets token selection: the next frame does not depend on earlier frames.
     pub fn reset(&mut self) {
-        self.selector.reset();
+        self.groups.iter_mut().for_each(|group| group.selector.reset());
     }
 
     /// Replaces the number of patch grids of a frame, the model's at first.
@@ -113,11 +144,13 @@ impl SceneRenderer {
 
     /// Replaces the rules of token selection and resets it.
     pub fn set_rules(&mut self, rules: SelectionRules) {
-        self.selector.set_rules(rules);
+        self.groups.iter_mut().for_each(|group| group.selector.set_rules(rules));
     }
 
-    /// Renders the next frames of a path, each from its own selection of `num_render_tokens` tokens, or from all tokens if
-    /// the scene has no more. Frames of all tokens are rendered [`Self::frames_per_call`] at a time. Frames larger than the
+    /// Renders the next frames of a path from the groups of tokens nearest to each: of every group from the
+    /// `num_render_tokens` tokens nearest to the view, or all its tokens if it has no more. A frame between groups is a mean
+    /// of their images with weights that change continuously along a path (`GroupBlend`); of `num_render_tokens`, each
+    /// group has its share. Frames of all tokens are rendered [`Self::frames_per_call`] at a time. Frames larger than the
     /// context views are interleaved from several of about their size: smooth, but without more detail.
     ///
     /// # Errors
@@ -134,53 +167,130 @@ impl SceneRenderer {
         width: usize,
         num_render_tokens: usize,
     ) -> Result<Vec<RenderedView>, ModelError> {
-        let mut rendered = Vec::with_capacity(views.len());
-        if num_render_tokens < self.num_storage_tokens() && !self.has_patch_tokens {
+        let selects = num_render_tokens < self.max_render_tokens();
+        if selects && !self.has_patch_tokens {
             let fix = format!(
                 "learned tokens belong to no view, so that none can be selected by the camera: render from all {}",
-                self.num_storage_tokens()
+                self.max_render_tokens()
             );
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: num_render_tokens.to_string(), fix });
         }
-        if num_render_tokens >= self.num_storage_tokens() {
-            for views in views.chunks(self.frames_per_call(height, width)) {
-                rendered.extend(self.render_call(views, height, width, None, 0.0)?);
+        let shares: Vec<Vec<(usize, f64)>> = views.iter().map(|view| self.shares(&view.c2w)).collect();
+        let mut rendered: Vec<Option<RenderedView>> = vec![None; views.len()];
+        for group in 0..self.groups.len() {
+            let share = |frame: usize| shares[frame].iter().find(|(other, _)| *other == group).map(|(_, share)| *share);
+            let frames: Vec<(usize, f64)> = (0..views.len()).filter_map(|frame| Some((frame, share(frame)?))).collect();
+            let per_call = if selects { 1 } else { self.frames_per_call(height, width) };
+            for frames in frames.chunks(per_call) {
+                let cameras: Vec<Camera> = frames.iter().map(|&(frame, _)| views[frame]).collect();
+                let count = (num_render_tokens as f64 * frames[0].1).ceil() as usize;
+                let images = self.render_group(group, &cameras, [height, width], selects.then_some(count))?;
+                for (&(frame, share), image) in frames.iter().zip(images) {
+                    RenderedView::blend(&mut rendered[frame], image, share as f32);
+                }
             }
-            return Ok(rendered);
+            if selects && frames.is_empty() {
+                // A group that comes back later starts a path of its own.
+                self.groups[group].selector.reset();
+            }
         }
-        for view in views {
-            let started = Instant::now();
-            let selected = self.selector.select(view, height, width, num_render_tokens)?;
-            let select_s = started.elapsed().as_secs_f64();
-            rendered.extend(self.render_call(&[*view], height, width, Some(selected), select_s)?);
-        }
-        Ok(rendered)
+        Ok(rendered.into_iter().flatten().collect())
     }
 
-    fn render_call(
-        &self,
+    /// Renders frames from the tokens of one group: all of them, or selected ones for a single frame.
+    fn render_group(
+        &mut self,
+        group: usize,
         views: &[Camera],
-        height: usize,
-        width: usize,
-        selected: Option<Vec<u32>>,
-        select_s: f64,
+        size: [usize; 2],
+        num_render_tokens: Option<usize>,
     ) -> Result<Vec<RenderedView>, ModelError> {
         let started = Instant::now();
+        let num_groups = self.groups.len();
+        let tokens = &mut self.groups[group];
+        let selected = match num_render_tokens {
+            Some(count) => Some(tokens.selector.select(&views[0], size[0], size[1], count)?),
+            None => None,
+        };
+        let select_s = if selected.is_some() { started.elapsed().as_secs_f64() } else { 0.0 };
+        let started = Instant::now();
+        let cache = selected.as_ref().map(|selected| tokens.cache.select(selected));
+        let in_scene = match selected {
+            Some(selected) => Some(selected.into_iter().map(|token| tokens.tokens[token as usize]).collect()),
+            // All tokens of a scene with one group.
+            None if num_groups == 1 => None,
+            None => Some(tokens.tokens.clone()),
+        };
+        let images = self.draw(cache.as_ref().unwrap_or(&self.groups[group].cache), views, size)?;
+        let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
+        let view =
+            |pixels: &[f32]| RenderedView { pixels: pixels.to_vec(), tokens: in_scene.clone(), select_s, render_s };
+        Ok(images.chunks_exact(size[0] * size[1] * 3).map(view).collect())
+    }
+
+    /// Draws frames from keys and values of tokens, `[views, height, width, 3]`.
+    fn draw(
+        &self,
+        cache: &KeyValueCache,
+        views: &[Camera],
+        [height, width]: [usize; 2],
+    ) -> Result<Vec<f32>, ModelError> {
         let cameras = Cameras::of_views(views, height, width, &self.device)?;
-        let some = selected.as_ref().map(|selected| self.cache.select(selected));
-        let cache = some.as_ref().unwrap_or(&self.cache);
         let draw = |cameras: &Cameras| self.renderer.render_cached(cache, cameras);
         let images = interleaved(self.trained_height, self.renderer.patch_size(), &cameras, draw);
-        let images = images.into_data().convert::<f32>();
-        let pixels = images.try_to_vec::<f32>().map_err(ModelError::device)?;
-        let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
-        if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
-            return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });
+        let pixels = images.into_data().convert::<f32>().try_to_vec::<f32>().map_err(ModelError::device)?;
+        match pixels.iter().position(|value| !value.is_finite()) {
+            Some(position) => Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position }),
+            None => Ok(pixels),
         }
-        let frames = pixels.chunks_exact(height * width * 3);
-        Ok(frames
-            .map(|pixels| RenderedView { pixels: pixels.to_vec(), tokens: selected.clone(), select_s, render_s })
-            .collect())
+    }
+
+    /// Returns the groups that a view is rendered from, with their shares, which add up to 1.
+    fn shares(&self, view: &Pose) -> Vec<(usize, f64)> {
+        let distances: Vec<f64> = self.groups.iter().map(|group| self.distance.to_group(view, &group.views)).collect();
+        blend_shares(&distances)
+    }
+}
+
+/// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
+const BLEND: f64 = 0.15;
+/// Most groups that a frame is rendered from.
+const MAX_BLENDED: usize = 3;
+
+/// Returns the nearest groups and their shares of a frame, which add up to 1 and change continuously with the distances: a
+/// share falls linearly to 0 where a group is [`BLEND`] farther than the nearest, or as far as the next after
+/// [`MAX_BLENDED`].
+fn blend_shares(distances: &[f64]) -> Vec<(usize, f64)> {
+    let mut order: Vec<usize> = (0..distances.len()).collect();
+    order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]));
+    let Some(&nearest) = order.first() else { return Vec::new() };
+    let limit = distances[nearest] + BLEND;
+    let limit = order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]));
+    let rooms = order.into_iter().take(MAX_BLENDED).map(|group| (group, limit - distances[group]));
+    let mut near: Vec<(usize, f64)> = rooms.filter(|(_, room)| *room > 0.0).collect();
+    if near.is_empty() {
+        return vec![(nearest, 1.0)];
+    }
+    let sum: f64 = near.iter().map(|(_, room)| room).sum();
+    near.iter_mut().for_each(|(_, room)| *room /= sum);
+    near
+}
+
+impl RenderedView {
+    /// Adds an image with its share of the frame.
+    fn blend(frame: &mut Option<Self>, mut image: Self, share: f32) {
+        image.pixels.iter_mut().for_each(|value| *value *= share);
+        let Some(frame) = frame else {
+            *frame = Some(image);
+            return;
+        };
+        frame.pixels.iter_mut().zip(&image.pixels).for_each(|(sum, value)| *sum += value);
+        frame.select_s += image.select_s;
+        frame.render_s += image.render_s;
+        if let (Some(tokens), Some(more)) = (&mut frame.tokens, image.tokens) {
+            tokens.extend(more);
+            tokens.sort_unstable();
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Writes scene files with plain tokens, version 2.
+//! Writes scene files with plain tokens.
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -72,6 +72,8 @@ impl Scene {
         self.check().map_err(refuse)?;
         let (tokens, scales) = format.encode(&self.tokens, self.model.dim)?;
         let (count, views) = (self.num_tokens(), self.context.len());
+        let sizes: Vec<u32> = self.groups.iter().map(|group| group.len() as u32).collect();
+        let members = self.groups.concat();
         let f64_bytes = |values: &mut dyn Iterator<Item = f64>| values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>();
         let f32_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
         let u32_bytes = |values: &[u32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
@@ -99,6 +101,8 @@ impl Scene {
         if let Some(scales) = scales {
             tensors.push(("token_scales", "F32", vec![count], f32_bytes(&scales)));
         }
+        tensors.push(("group_sizes", "U32", vec![sizes.len()], u32_bytes(&sizes)));
+        tensors.push(("group_views", "U32", vec![members.len()], u32_bytes(&members)));
         tensors.push(("context_frames", "U32", vec![views], u32_bytes(&self.context_frames)));
         if has_places {
             tensors.push(("token_ids", "U32", vec![count], u32_bytes(&self.token_ids)));

@@ -111,9 +111,10 @@ export function drawContext(canvas, image, scene, view, mode, bits) {
   const [columns, rows] = scene.size.map((pixels) => pixels / scene.patch);
   const [w, h] = [width / columns, height / rows];
   const isSelected = (token) => !bits || (bits[token >> 3] >> (token & 7)) & 1;
-  const first = view * rows * columns;
+  const patches = rows * columns;
   if (mode === "clusters" && scene.clusters) {
-    for (let patch = 0; patch < rows * columns; patch++) {
+    const first = scene.members.indexOf(view) * patches;
+    for (let patch = 0; patch < patches; patch++) {
       const token = scene.clusters[first + patch];
       context.fillStyle = `hsl(${hue(token)} 85% 55% / ${isSelected(token) ? 0.55 : 0.12})`;
       context.fillRect((patch % columns) * w, Math.floor(patch / columns) * h, w + 0.5, h + 0.5);
@@ -123,8 +124,8 @@ export function drawContext(canvas, image, scene, view, mode, bits) {
   context.fillStyle = "rgb(0 0 0 / 55%)";
   context.fillRect(0, 0, width, height);
   scene.tokenIds.forEach((id, token) => {
-    const patch = id - first;
-    if (patch < 0 || patch >= rows * columns) return;
+    if (scene.members[Math.floor(id / patches)] !== view) return;
+    const patch = id % patches;
     const [x, y] = [(patch % columns) * w, Math.floor(patch / columns) * h];
     const scaleX = image.width / columns;
     const scaleY = image.height / rows;

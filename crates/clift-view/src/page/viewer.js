@@ -134,7 +134,7 @@ function onHello(hello) {
 async function onScene(header, parts) {
   const images = await Promise.all(parts.map((part) => createImageBitmap(new Blob([part], { type: "image/png" }))));
   const isOther = view.sceneKey !== header.key;
-  const former = view.scene ? settings().tokens / view.scene.stored : 1;
+  const former = view.scene ? settings().tokens / view.scene.renderable : 1;
   view.sceneKey = header.key;
   view.scene = {
     ...header, index: header.scene, tokenIds: header.token_ids, meanC2w: header.mean_c2w, images,
@@ -276,13 +276,13 @@ function drawKeyframes() {
 
 /** Offered token counts: 1, 2, 3, 4, 6, 8, 12, .. up to all. */
 function tokenCounts() {
-  const { stored } = view.scene;
+  const { renderable } = view.scene;
   const counts = [];
-  for (let power = 1; power < stored; power *= 2) {
+  for (let power = 1; power < renderable; power *= 2) {
     counts.push(power);
-    if (power > 1 && power * 1.5 < stored) counts.push(power * 1.5);
+    if (power > 1 && power * 1.5 < renderable) counts.push(power * 1.5);
   }
-  return [...counts, stored];
+  return [...counts, renderable];
 }
 
 function fillPanel(header, share) {
@@ -295,7 +295,7 @@ function fillPanel(header, share) {
   $("scene").value = header.scene;
   const counts = tokenCounts();
   $("render").max = counts.length - 1;
-  const wanted = share * header.stored;
+  const wanted = share * header.renderable;
   const gaps = counts.map((count) => Math.abs(Math.log(count / wanted)));
   $("render").value = gaps.indexOf(Math.min(...gaps));
   const stored = $("stored");
@@ -332,8 +332,8 @@ function fillPanel(header, share) {
 
 function updateLabels() {
   if (!view.scene) return;
-  const { stored, storage_counts: counts } = view.scene;
-  labelled("render", `of ${stored}`, settings().tokens);
+  const { renderable, storage_counts: counts } = view.scene;
+  labelled("render", `of ${renderable}`, settings().tokens);
   labelled("stored", `of ${view.scene.num_patches}`, counts[$("stored").valueAsNumber]);
   $("seconds-value").textContent = `${path.seconds} s`;
   $("contexts-hint").textContent = {
@@ -359,7 +359,7 @@ function commandText() {
   const { tokens, selection, precision } = settings();
   const size = scene.sizes[Number($("size").value)];
   const words = [scene.render_command, "--path poses.json", "-o frames"];
-  if (tokens < scene.stored) words.push(`--render ${tokens} --selection ${selection}`);
+  if (tokens < scene.renderable) words.push(`--render ${tokens} --selection ${selection}`);
   words.push(`--precision ${precision}`);
   if (size.join() !== scene.size.join()) words.push(`--size ${size.join("x")}`);
   return [scene.encode_command, words.join(" ")].filter(Boolean).join("\n");

@@ -42,7 +42,11 @@ pub struct OpenedScene<'a> {
     pub bytes: u64,
     /// Kind and number format of the tokens.
     pub tokens: String,
-    /// Patch of each token.
+    /// Most tokens of a group of context views, from which a frame is rendered.
+    pub renderable: usize,
+    /// Context view of each member of the groups.
+    pub members: Vec<u32>,
+    /// Patch of each token, counted over the members.
     pub token_ids: &'a [u32],
     /// Token of each patch; `null` for a scene file, which does not hold the clusters.
     pub clusters: Option<&'a [u32]>,

@@ -1,10 +1,10 @@
 //! A scene file, or the test scenes of a run.
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, EvaluationItem};
+use clift_data::ClipReader;
 use clift_eval::file_name;
 use clift_model::{DeviceName, Renderer, TokenCount, TrainedModel};
-use clift_scene::{EncodeOptions, EncodedScene, Scene, TokenCoding, TokenFormat, encode};
+use clift_scene::{ContextChoice, Contexts, EncodeOptions, EncodedScene, Scene, TokenCoding, TokenFormat, encode};
 
 use crate::error::ViewError;
 use crate::protocol::request::OpenRequest;
@@ -41,8 +41,8 @@ pub struct RunScenes {
     pub model: TrainedModel,
     /// The data of the run.
     pub reader: ClipReader,
-    /// The offered scenes with their context frames, at least one.
-    pub items: Vec<EvaluationItem>,
+    /// The offered scenes with their context views, at least one.
+    pub items: Vec<(usize, ContextChoice)>,
     /// Settings of the encoding; the context frames and the number of stored tokens are replaced.
     pub options: EncodeOptions,
     /// Offered numbers of stored tokens.
@@ -67,7 +67,7 @@ impl SceneSet {
     pub(crate) fn keys(&self) -> Vec<String> {
         match self {
             Self::File(file) => vec![file.scene.key.clone()],
-            Self::Run(run) => run.items.iter().map(|item| run.reader.source.key(item.scene).to_owned()).collect(),
+            Self::Run(run) => run.items.iter().map(|(scene, _)| run.reader.source.key(*scene).to_owned()).collect(),
         }
     }
 
@@ -103,7 +103,7 @@ impl SceneSet {
     pub(crate) fn true_image(&self, open: &OpenScene, frame: usize) -> Result<TrueImage, ViewError> {
         check_position("frame", frame, open.origin.frames.len())?;
         let Self::Run(run) = self else { return Err(ViewError::NoScene) };
-        let index = run.items[open.origin.index].scene;
+        let (index, _) = run.items[open.origin.index];
         true_frames::read(&run.reader, index, &open.scene, open.origin.frames[frame])
     }
 }
@@ -111,15 +111,16 @@ impl SceneSet {
 impl RunScenes {
     fn open(&self, request: OpenRequest, device: &Device, name: DeviceName) -> Result<OpenScene, ViewError> {
         check_position("scene", request.scene, self.items.len())?;
-        let EvaluationItem { scene: index, views } = &self.items[request.scene];
+        let (index, context) = &self.items[request.scene];
         let clift_data::ClipOptions { width, height, .. } = self.reader.options;
-        let num_tokens = self.model.config.num_tokens(views.context.len(), height, width)?;
+        let num_members = Contexts::choose(&self.reader, *index, context, 0)?.num_members();
+        let num_tokens = self.model.config.num_tokens(num_members, height, width)?;
         let counts = self.storage_counts(num_tokens);
         // Without a request, the count nearest to that of `clift encode`, a quarter.
         let wanted = request.stored.unwrap_or(num_tokens / 4);
         let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
         let options = EncodeOptions {
-            context: Some(views.context.clone()),
+            context: context.clone(),
             stored_tokens: Some(TokenCount::Count(stored)),
             ..self.options.clone()
         };
@@ -127,21 +128,14 @@ impl RunScenes {
         scene.tokens = RUN_FORMAT.round(&scene.tokens, scene.model.dim)?;
         // The key comes from data: as a file name it must not lead to another folder.
         let file = format!("{}.clift", file_name(&scene.key));
-        let frames = views.context.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
-        let stored = stored.to_string();
-        let scene_args = [
-            "--scene",
-            &scene.key,
-            "--context",
-            &frames,
-            "--stored-tokens",
-            &stored,
-            "--format",
-            RUN_FORMAT.name(),
-            "-o",
-            &file,
-        ];
-        let encode_args: Vec<String> = self.encode_args.iter().cloned().chain(scene_args.map(str::to_owned)).collect();
+        let mut scene_args = vec!["--scene".to_owned(), scene.key.clone()];
+        if let ContextChoice::Frames(frames) = context {
+            let frames = frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+            scene_args.extend(["--context".to_owned(), frames]);
+        }
+        let (stored, format) = (stored.to_string(), RUN_FORMAT.name());
+        scene_args.extend(["--stored-tokens", &stored, "--format", format, "-o", &file].map(str::to_owned));
+        let encode_args: Vec<String> = self.encode_args.iter().cloned().chain(scene_args).collect();
         let render_args: Vec<String> = [file.clone()].into_iter().chain(self.render_args.clone()).collect();
         let origin = SceneOrigin {
             index: request.scene,

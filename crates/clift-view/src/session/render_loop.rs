@@ -122,7 +122,7 @@ impl RenderLoop {
             rest: request.rest,
             format: if request.rest { "png" } else { "jpeg" },
             size: [width, height],
-            tokens,
+            tokens: view.tokens.as_ref().map_or(stored, Vec::len),
             stored,
             select_ms: 1e3 * view.select_s,
             render_ms: 1e3 * view.render_s,

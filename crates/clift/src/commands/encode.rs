@@ -5,17 +5,20 @@ use std::path::{Path, PathBuf};
 use clift_data::{ClipReader, Split, plural};
 use clift_model::{TokenCount, TokenKind};
 use clift_scene::{
-    ClusterMap, Coding, EncodeOptions, EncodedScene, HeldOutFrame, MAX_TURN_DEG, Scene, SceneOptions, TokenCoding,
-    WrittenScene, check_output_path, encode_scene, find_scene, frame_positions,
+    CheckedView, ClusterMap, Coding, ContextChoice, EncodeOptions, EncodedScene, MIN_CONTEXT_PSNR, Scene, SceneError,
+    SceneOptions, TokenCoding, WrittenScene, check_output_path, encode_scene, find_scene, frame_positions,
 };
 
 use crate::commands::args::model_args::ModelArgs;
-use crate::commands::args::parse::{parse_kb, parse_loss, parse_output, parse_split};
+use crate::commands::args::parse::{parse_hold_out, parse_kb, parse_loss, parse_output, parse_split};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
+
+/// Most frames of a list.
+const MAX_LISTED: usize = 8;
 
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
@@ -40,14 +43,24 @@ pub struct EncodeArgs {
     /// Split of the data set: train or test
     #[arg(long, value_name = "SPLIT", default_value = "test", value_parser = parse_split)]
     pub split: Split,
-    /// Context frames by position or file name [default: spread along the path]
+    /// Context frames by position or file name, encoded together [default: groups of neighbours]
     ///
     /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
     /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. Numbers alone are positions, unless one begins with a zero:
-    /// `0005` is a name. By default, as many as in training; of a DIR of the command line, every fourth frame, up to three
-    /// times as many, if the network has camera-relative attention.
-    #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
+    /// `0005` is a name. By default, a DIR of the command line is encoded in groups of neighbours, as many views each as in
+    /// training, that together contain every photo (up to 128); a view is rendered from the groups nearest to it. A scene of
+    /// the run's data, or of a network without camera-relative attention, has one group along the camera path.
+    #[arg(long, value_name = "FRAMES", value_delimiter = ',', conflicts_with_all = ["near", "groups"])]
     pub context: Vec<String>,
+    /// Encode this frame and those nearest to it, as one group
+    #[arg(long, value_name = "FRAME", conflicts_with = "groups")]
+    pub near: Option<String>,
+    /// Number of groups of neighbours [default: 3 for every 4 photos]
+    #[arg(long, value_name = "COUNT")]
+    pub groups: Option<usize>,
+    /// Leave one of N photos out, and compare it with its rendering
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = parse_hold_out)]
+    pub hold_out: usize,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
@@ -77,6 +90,22 @@ impl EncodeArgs {
         let size = self.size_kb.map(|kb| Coding::Bytes((kb * 1e3) as u64));
         self.quality.map(Coding::MeasuredLoss).or(size).or(self.format.map(Coding::from))
     }
+
+    /// Returns the context views; `names` are those of all frames.
+    fn contexts(&self, model: &ModelArgs, names: &[String]) -> Result<ContextChoice, SceneError> {
+        let num_views = model.config.data.views.max_context;
+        if let Some(frame) = &self.near {
+            let frame = frame_positions(std::slice::from_ref(frame), names)?[0];
+            return Ok(ContextChoice::Near { frame, num_views });
+        }
+        if self.context.is_empty() {
+            return Ok(match self.groups {
+                None => model.context(),
+                num_groups => ContextChoice::Neighbours { num_views, num_groups },
+            });
+        }
+        Ok(ContextChoice::Frames(frame_positions(&self.context, names)?))
+    }
 }
 
 /// Encodes one scene and writes its file.
@@ -97,10 +126,9 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     }
     let source = model_args.open_data(args.split)?.source;
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
-    let context = frame_positions(&args.context, &source.frame_names(scene)?)?;
     let encode = EncodeOptions {
-        context: (!args.context.is_empty()).then_some(context),
-        num_context: model_args.num_context(source.as_ref(), scene)?,
+        context: args.contexts(&model_args, &source.frame_names(scene)?)?,
+        hold_out: args.hold_out,
         stored_tokens: args.stored_tokens,
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
@@ -118,28 +146,60 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
 
 fn print(written: &WrittenScene, out: &Path, model: &Path) -> anyhow::Result<()> {
     print_result(&describe(written, out))?;
-    if written.turn_deg > MAX_TURN_DEG {
-        print_warning(format!(
-            "context views differ in direction by up to {:.0} degrees; models that were trained on one side of a \
-             place, such as models/rooms, render noise there: choose views of one side with --context",
-            written.turn_deg
-        ));
-    }
     if let (Some([width, height]), [w, h]) = (written.cropped, written.image_size) {
         print_note(&format!("of images of {w} x {h}, the central {width} x {height} pixels are used"));
     }
-    let Some(HeldOutFrame { frame, psnr, nearest_psnr }) = written.held_out else {
-        return print_result("check: no frame beside the contexts to compare a rendering with");
-    };
-    let frame = written.frame_name(frame);
+    print_contexts(written)?;
+    match written.others[..] {
+        [] => Ok(()),
+        [CheckedView { frame, psnr, baseline_psnr }] => {
+            let frame = written.frame_name(frame);
+            print_result(&format!(
+                "check: frame {frame}, not a context: {psnr:.2} dB rendered, {baseline_psnr:.2} dB copied from the nearest \
+                 context"
+            ))?;
+            if psnr < baseline_psnr {
+                print_warning(format!(
+                    "the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
+                     from the training scenes of {}, few tokens are stored, or the run is not trained enough",
+                    model.display()
+                ));
+            }
+            Ok(())
+        }
+        ref views => {
+            let mean = |value: fn(&CheckedView) -> f64| {
+                clift_core::mean(&views.iter().map(value).collect::<Vec<_>>()).unwrap_or_default()
+            };
+            print_result(&format!(
+                "check: {} frames held out: {:.2} dB rendered, {:.2} dB copied from the nearest context; {} rendered better",
+                views.len(),
+                mean(|view| view.psnr),
+                mean(|view| view.baseline_psnr),
+                views.iter().filter(|view| view.psnr > view.baseline_psnr).count()
+            ))
+        }
+    }
+}
+
+/// Prints how well the context views come out, and warns of fog.
+fn print_contexts(written: &WrittenScene) -> anyhow::Result<()> {
+    let psnrs: Vec<f64> = written.contexts.iter().map(|view| view.psnr).collect();
+    let fog: Vec<String> =
+        written.contexts.iter().filter(|view| view.is_fog()).map(|view| written.frame_name(view.frame)).collect();
     print_result(&format!(
-        "check: frame {frame}, not a context: {psnr:.2} dB rendered, {nearest_psnr:.2} dB copied from the nearest context"
+        "check: the context views are rendered at {:.2} dB",
+        clift_core::mean(&psnrs).unwrap_or_default()
     ))?;
-    if psnr < nearest_psnr {
+    if !fog.is_empty() {
+        let more = if fog.len() > MAX_LISTED { ", .." } else { "" };
         print_warning(format!(
-            "the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
-             from the training scenes of {}, few tokens are stored, or the run is not trained enough",
-            model.display()
+            "{} of {} context views are rendered below {MIN_CONTEXT_PSNR} dB or worse than the mean image, as fog: {}{more}; \
+             their neighbours are too far away: take more photos in between, encode one part of the place with --near PHOTO, \
+             or train on the capture (configs/capture.toml)",
+            fog.len(),
+            psnrs.len(),
+            fog[..fog.len().min(MAX_LISTED)].join(", ")
         ));
     }
     Ok(())
@@ -148,19 +208,30 @@ fn print(written: &WrittenScene, out: &Path, model: &Path) -> anyhow::Result<()>
 fn describe(written: &WrittenScene, path: &Path) -> String {
     let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = &written.encoded;
     let num_tokens = scene.num_tokens();
-    let frames: Vec<String> = scene.context_frames.iter().map(|&frame| written.frame_name(frame as usize)).collect();
+    let mut frames: Vec<String> =
+        scene.context_frames.iter().map(|&frame| written.frame_name(frame as usize)).collect();
+    if frames.len() > MAX_LISTED {
+        frames.splice(MAX_LISTED / 2..frames.len() - MAX_LISTED / 2, ["..".into()]);
+    }
+    let groups = match scene.groups.len() {
+        1 => String::new(),
+        count => format!(" in {count} groups"),
+    };
     let clusters = match scene.kind {
         TokenKind::All => String::new(),
         _ => format!("\ntokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}"),
     };
     format!(
-        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {}), {}\nscene {}, {} of {} x {}: frames {}{clusters}",
+        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {}), {}\nscene {}, {}{groups} of {} x {}: frames {}{clusters}",
         path.display(),
         scene.kind,
         written.stored,
         file_size(written.file_bytes),
         scene.key,
-        plural(scene.context.len(), "view"),
+        match written.num_frames - scene.context.len() {
+            0 => plural(scene.context.len(), "view"),
+            _ => format!("{} of {}", scene.context.len(), plural(written.num_frames, "view")),
+        },
         scene.width,
         scene.height,
         frames.join(", "),

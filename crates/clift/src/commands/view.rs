@@ -4,10 +4,10 @@ use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use clift_data::{ClipReader, EvaluationItem, SkipReport, Split, ViewIndices};
+use clift_data::{ClipReader, SkipReport, Split};
 use clift_eval::{EvalFrames, evaluation_items};
 use clift_model::{DeviceName, ModelConfig};
-use clift_scene::{EncodeOptions, Scene, load_renderer, spread_contexts};
+use clift_scene::{ContextChoice, Contexts, EncodeOptions, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
 use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
@@ -111,7 +111,8 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
             eval.num_scenes = MAX_SCENES;
         }
         let (items, skip_report, _) = evaluation_items(&eval, &reader, frames)?;
-        (items, skip_report)
+        let contexts = items.into_iter().map(|item| (item.scene, ContextChoice::Frames(item.views.context)));
+        (contexts.collect(), skip_report)
     } else {
         folder_items(&model_args, &reader)?
     };
@@ -120,13 +121,12 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
         print_note(&skip_report.to_string());
     }
     let options = EncodeOptions {
-        context: None,
-        num_context: config.eval.num_context,
         stored_tokens: Some(config.eval.validation_stored_tokens),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
         model_path: text(&given),
+        ..EncodeOptions::default()
     };
     let mut encode_args: Vec<String> = std::iter::once(&given).chain(&folder).map(|path| text(path)).collect();
     encode_args.extend(args.overrides.set.iter().flat_map(|set| ["--set".into(), set.clone()]));
@@ -146,13 +146,17 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
 }
 
 /// Lists the scenes of a folder with the context views that `clift encode` takes.
-fn folder_items(model_args: &ModelArgs, reader: &ClipReader) -> anyhow::Result<(Vec<EvaluationItem>, SkipReport)> {
+fn folder_items(
+    model_args: &ModelArgs,
+    reader: &ClipReader,
+) -> anyhow::Result<(Vec<(usize, ContextChoice)>, SkipReport)> {
     let source = reader.source.as_ref();
     let count = source.num_scenes().min(MAX_SCENES);
     let (mut items, mut skip_report) = (Vec::with_capacity(count), SkipReport::new(count));
     for scene in 0..count {
-        match spread_contexts(reader, scene, model_args.num_context(source, scene)?) {
-            Ok(context) => items.push(EvaluationItem { scene, views: ViewIndices { context, target: Vec::new() } }),
+        let context = model_args.context();
+        match Contexts::choose(reader, scene, &context, 0) {
+            Ok(_) => items.push((scene, context)),
             Err(error) => skip_report.skip(source.key(scene), error.to_string()),
         }
     }

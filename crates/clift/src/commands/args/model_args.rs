@@ -2,12 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{
-    DataError, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
-    open_source,
-};
+use clift_data::{DatasetRoot, FileOptions, OpenedSource, SourceKind, SourceOptions, Split, open_dataset, open_source};
 use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
-use clift_scene::default_num_context;
+use clift_scene::ContextChoice;
 use clift_train::{Config, Override};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
@@ -85,17 +82,13 @@ impl ModelArgs {
         Ok(opened)
     }
 
-    /// Returns the default number of context views of a scene: as many as in training, or [`default_num_context`] of a scene
-    /// of the folder.
-    ///
-    /// # Errors
-    /// Those of counting the frames.
-    pub fn num_context(&self, source: &dyn SceneSource, scene: usize) -> Result<usize, DataError> {
+    /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder.
+    pub fn context(&self) -> ContextChoice {
         let trained = self.config.data.views.max_context;
-        if self.folder.is_none() {
-            return Ok(trained);
+        match self.folder {
+            None => ContextChoice::Spread(trained),
+            Some(_) => ContextChoice::for_capture(&self.config.model, trained),
         }
-        default_num_context(&self.config.model, trained, source, scene)
     }
 
     /// Reads the weights.

@@ -101,6 +101,11 @@ pub(crate) fn parse_loss(text: &str) -> Result<f64, String> {
     parse_number(text, |loss| (1e-3..=10.0).contains(loss), "write a loss in dB, 0.001 to 10")
 }
 
+/// Parses how many photos one is left out of: 0 for none, or at least 2.
+pub(crate) fn parse_hold_out(text: &str) -> Result<usize, String> {
+    parse_number(text, |count| *count != 1, "write 2 or more, such as 8, or 0 for none")
+}
+
 /// Parses a size in kB.
 pub(crate) fn parse_kb(text: &str) -> Result<f64, String> {
     parse_number(text, |kb| *kb > 0.0 && *kb <= 1e9, "write kilobytes, more than 0")

@@ -7,7 +7,7 @@ use anyhow::Context;
 use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_path};
 use clift_data::read_poses;
 use clift_eval::available_bytes;
-use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision};
+use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, TokenCount};
 use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
 use serde::Serialize;
 
@@ -86,7 +86,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let report = Report {
         scene: scene.key.clone(),
         path: args.path.to_string(),
-        selection: (num_render_tokens < scene.num_tokens()).then(|| args.selection.name()),
+        selection: (num_render_tokens < renderer.max_render_tokens()).then(|| args.selection.name()),
         patch_grids,
         device: device.as_str(),
         precision,
@@ -159,9 +159,15 @@ fn token_count(
     height: usize,
     width: usize,
 ) -> anyhow::Result<(usize, Option<RenderBudget>)> {
-    let num_storage_tokens = scene.num_tokens();
+    // A share is one of the tokens that a frame can be rendered from.
+    let most = renderer.max_render_tokens();
     let Some(budget_ms) = args.budget_ms else {
-        return Ok((args.render.map_or(Ok(num_storage_tokens), |count| count.of(num_storage_tokens))?, None));
+        let count = match args.render {
+            Some(TokenCount::Count(count)) => TokenCount::Count(count).of(scene.num_tokens())?.min(most),
+            Some(share) => share.of(most)?,
+            None => most,
+        };
+        return Ok((count, None));
     };
     let times = RenderBudget::measure(renderer, view, height, width)?;
     for (count, seconds) in times.some.iter().chain([&times.all]) {
@@ -175,7 +181,7 @@ fn token_count(
             "the fastest frame takes {least_ms} ms on this device; {fewer}raise --budget-ms or choose a smaller --size"
         );
     };
-    print_note(&format!("{budget_ms} ms per frame: {count} of {num_storage_tokens} tokens"));
+    print_note(&format!("{budget_ms} ms per frame: {count} of {most} tokens"));
     Ok((count, Some(times)))
 }
 

@@ -1,48 +1,67 @@
-//! A check of an encoded scene: a frame that is not a context view, rendered and compared with the nearest context view.
+//! Checks of an encoded scene: renderings of frames that are not context views, and of the context views, beside the photos.
 
 use clift_core::Camera;
 use clift_data::{ClipReader, ViewIndices};
 use clift_model::{SelectionPreset, TrainedModel, psnr};
 
-use crate::check::baselines::{nearest_image, view_image};
+use crate::check::baselines::{mean_image, nearest_image, view_image};
 use crate::error::SceneError;
 use crate::scene::scene::Scene;
 use crate::scene::scene_renderer::SceneRenderer;
 
-/// Largest number of frames that are tried: images may be unreadable.
+/// Largest number of times that frames are tried: images may be unreadable.
 const MAX_TRIES: usize = 3;
 
-/// A frame that is not a context view, rendered from the stored tokens.
+/// PSNR of a context view, in dB, below which its rendering is fog: a capture whose photos are too far apart.
+pub const MIN_CONTEXT_PSNR: f64 = 23.0;
+
+/// A frame of the scene, rendered from the stored tokens.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct HeldOutFrame {
+pub struct CheckedView {
     /// The frame of the scene.
     pub frame: usize,
     /// PSNR of the rendering, in dB.
     pub psnr: f64,
-    /// PSNR of a copy of the nearest context view, in dB.
-    pub nearest_psnr: f64,
+    /// PSNR of a copy of the nearest context view, in dB; of a context view, that of the mean of all context images.
+    pub baseline_psnr: f64,
 }
 
-impl HeldOutFrame {
-    /// Renders the frame farthest from the contexts, by number, between the first and the last context; without one, the
-    /// nearest beside them. `scene` was encoded by `model` from scene `index` of `reader`. Returns `None` if every frame is a
-    /// context, or no other frame is readable.
+impl CheckedView {
+    /// Renders frames that are not context views: all that are `held_out`, or without any the frame farthest from the
+    /// contexts, by number, between the first and the last; without one, the nearest beside them. `scene` was encoded by `model`
+    /// from scene `index` of `reader`. Returns none if every frame is a context, or no other frame is readable.
     ///
     /// # Errors
     /// The errors of the model.
-    pub fn render(
+    pub fn other_frames(
         model: &TrainedModel,
-        reader: &ClipReader,
-        index: usize,
+        (reader, index): (&ClipReader, usize),
         scene: &Scene,
-    ) -> Result<Option<Self>, SceneError> {
-        let Some(CheckViews { frames, cameras, truth, size, nearest }) = CheckViews::read(reader, index, scene, 1)?
-        else {
-            return Ok(None);
+        held_out: &[usize],
+    ) -> Result<Vec<Self>, SceneError> {
+        let views = match held_out {
+            [] => CheckViews::read(reader, index, scene, 1)?,
+            _ => Some(CheckViews::of_frames(reader, index, scene, held_out)?),
         };
-        let pixels = render_scene(model, scene, &cameras, size)?.concat();
-        let nearest_psnr = psnr(&nearest[0], &truth)?;
-        Ok(Some(Self { frame: frames[0], psnr: psnr(&pixels, &truth)?, nearest_psnr }))
+        views.map_or(Ok(Vec::new()), |views| views.render(model, scene, |view| &views.nearest[view]))
+    }
+
+    /// Renders the context views.
+    ///
+    /// # Errors
+    /// Those of reading the images, and of the model.
+    pub fn contexts(
+        model: &TrainedModel,
+        (reader, index): (&ClipReader, usize),
+        scene: &Scene,
+    ) -> Result<Vec<Self>, SceneError> {
+        let views = CheckViews::contexts(reader, index, scene)?;
+        views.render(model, scene, |_| &views.mean)
+    }
+
+    /// Whether the rendering of a context view is fog.
+    pub fn is_fog(&self) -> bool {
+        self.psnr < MIN_CONTEXT_PSNR || self.psnr < self.baseline_psnr
     }
 }
 
@@ -56,6 +75,8 @@ pub(crate) struct CheckViews {
     pub size: [usize; 2],
     /// The context view nearest to every frame.
     pub nearest: Vec<Vec<f32>>,
+    /// Mean of the context images.
+    pub mean: Vec<f32>,
 }
 
 impl CheckViews {
@@ -95,7 +116,24 @@ impl CheckViews {
             size: [clip.target.height, clip.target.width],
             cameras: clip.target.cameras,
             nearest: nearest?,
+            mean: mean_image(&clip.context)?,
         })
+    }
+
+    /// Compares renderings of the frames with the photos, and the photos with the `baseline` of each.
+    fn render<'a>(
+        &'a self,
+        model: &TrainedModel,
+        scene: &Scene,
+        baseline: impl Fn(usize) -> &'a [f32],
+    ) -> Result<Vec<CheckedView>, SceneError> {
+        let rendered = render_scene(model, scene, &self.cameras, self.size)?;
+        let views = rendered.iter().zip(self.truth.chunks_exact(self.size[0] * self.size[1] * 3)).enumerate();
+        let view = |(view, (pixels, truth)): (usize, (&Vec<f32>, &[f32]))| {
+            let baseline_psnr = psnr(baseline(view), truth)?;
+            Ok(CheckedView { frame: self.frames[view], psnr: psnr(pixels, truth)?, baseline_psnr })
+        };
+        views.map(view).collect()
     }
 }
 

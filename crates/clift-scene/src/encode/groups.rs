@@ -1,0 +1,71 @@
+//! Groups of neighbouring views, each encoded as in training: views far apart, encoded together, come out as fog.
+
+use clift_core::{Pose, ViewDistance};
+
+/// Chooses `num_groups` groups of `num_views` neighbours that together contain every view, in ascending order each. Groups
+/// overlap. There are more than `num_groups` if these leave a view out.
+///
+/// A group is a seed with the views nearest to it. The next seed is the view farthest from all seeds, among the views in no
+/// group as long as there are any.
+pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usize) -> Vec<Vec<usize>> {
+    let distance = ViewDistance::new(views);
+    let mut to_seeds = vec![f64::INFINITY; views.len()];
+    let mut is_left_out = vec![true; views.len()];
+    let mut groups = Vec::new();
+    for _ in 0..views.len() {
+        let any_left = is_left_out.contains(&true);
+        if groups.len() >= num_groups && !any_left {
+            break;
+        }
+        // The first of equally far views.
+        let candidates = (0..views.len()).rev().filter(|&view| is_left_out[view] || !any_left);
+        let Some(seed) = candidates.max_by(|&a, &b| to_seeds[a].total_cmp(&to_seeds[b])) else { break };
+        let group = nearest_views(views, &distance, seed, num_views);
+        for &view in &group {
+            is_left_out[view] = false;
+        }
+        for (view, least) in to_seeds.iter_mut().enumerate() {
+            *least = least.min(distance.between(&views[view], &views[seed]));
+        }
+        groups.push(group);
+    }
+    groups.sort();
+    groups.dedup();
+    groups
+}
+
+/// Returns a view and the `num_views - 1` nearest others, in ascending order.
+pub(crate) fn nearest_views(views: &[Pose], distance: &ViewDistance, seed: usize, num_views: usize) -> Vec<usize> {
+    let mut others: Vec<usize> = (0..views.len()).filter(|&view| view != seed).collect();
+    let to_seed = |view: usize| distance.between(&views[view], &views[seed]);
+    others.sort_by(|&a, &b| to_seed(a).total_cmp(&to_seed(b)));
+    others.truncate(num_views - 1);
+    others.push(seed);
+    others.sort_unstable();
+    others
+}
+
+#[cfg(test)]
+mod tests {
+    use clift_core::DVec3;
+
+    use super::*;
+
+    fn on_a_line(places: &[f64]) -> Vec<Pose> {
+        places.iter().map(|&x| Pose { translation: x * DVec3::X, ..Pose::IDENTITY }).collect()
+    }
+
+    #[test]
+    fn groups_are_neighbours_and_contain_every_view() {
+        let steady: Vec<f64> = (0..10).map(f64::from).collect();
+        let groups = |places: &[f64], count| neighbour_groups(&on_a_line(places), 4, count);
+        assert_eq!(groups(&steady, 1), [vec![0, 1, 2, 3], vec![2, 3, 4, 5], vec![6, 7, 8, 9]], "as few as needed");
+        let more = groups(&steady, 6);
+        assert!(more.iter().all(|group| group.len() == 4 && group[3] - group[0] <= 4), "{more:?}");
+        assert!((0..10).all(|view| more.iter().any(|group| group.contains(&view))), "{more:?}");
+        assert_eq!(groups(&steady[..3], 5), [vec![0, 1, 2]], "equal groups count once");
+        // Two clusters far apart are not mixed.
+        let apart = groups(&[0.0, 0.1, 0.2, 0.3, 9.0, 9.1, 9.2, 9.3], 2);
+        assert_eq!(apart, [vec![0, 1, 2, 3], vec![4, 5, 6, 7]]);
+    }
+}
