@@ -4,7 +4,7 @@
 use clift_core::{Pose, PoseNormalization, item_rng};
 use clift_data::Clip;
 use clift_model::{Tokens, TrainedModel};
-use clift_scene::{Scene, TokenCodec, TokenCoding, TokenFormat, scene_file_bytes};
+use clift_scene::{ContextGroup, Scene, TokenCodec, TokenCoding, TokenFormat, scene_file_bytes};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
@@ -107,7 +107,7 @@ fn scene_of(clip: &Clip, codec: &TokenCodec, ids: &[u32], tokens: Vec<f32>, mode
         width: clip.context.width,
         context: clip.context.cameras.clone(),
         context_frames: clip.context.frame_index.iter().map(|&frame| frame as u32).collect(),
-        groups: Scene::single_group(clip.context.num_views()),
+        groups: vec![ContextGroup::of_all(clip.context.num_views())],
         world: PoseNormalization { mean_c2w: Pose::IDENTITY, scale: 1.0 },
         token_ids: ids.into(),
         tokens,

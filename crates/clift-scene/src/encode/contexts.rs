@@ -2,10 +2,11 @@
 
 use clift_core::{Pose, PoseNormalization, ViewDistance};
 use clift_data::{ClipReader, DataError, contexts_along_path, is_held_out};
-use clift_model::{CameraEncoding, ModelConfig, ModelError};
+use clift_model::{ModelConfig, ModelError};
 
 use crate::encode::groups::{nearest_views, neighbour_groups};
 use crate::error::SceneError;
+use crate::scene::scene::ContextGroup;
 
 /// Most context views of a scene in groups.
 const MAX_VIEWS: usize = 128;
@@ -37,12 +38,12 @@ pub enum ContextChoice {
 
 impl ContextChoice {
     /// Returns the default for a captured scene and a network that was trained with up to `num_views` views: groups of
-    /// neighbours with camera-relative attention, to which it does not matter where the origin is; else views along the path.
+    /// neighbours; of learned tokens, which have no place, views along the path.
     pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
-        if model.camera_encoding == CameraEncoding::Plucker || !model.has_patch_tokens() {
-            return Self::Spread(num_views);
+        match model.has_patch_tokens() {
+            true => Self::Neighbours { num_views, num_groups: None },
+            false => Self::Spread(num_views),
         }
-        Self::Neighbours { num_views, num_groups: None }
     }
 }
 
@@ -51,8 +52,8 @@ impl ContextChoice {
 pub struct Contexts {
     /// Frames of the scene.
     pub frames: Vec<usize>,
-    /// Groups of views that are encoded together, as positions in `frames`.
-    pub groups: Vec<Vec<usize>>,
+    /// Groups of views that are encoded together.
+    pub groups: Vec<ContextGroup>,
     /// The frame of their poses.
     pub normalization: PoseNormalization,
 }
@@ -73,21 +74,25 @@ impl Contexts {
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
         let frames = choose_frames(&poses, choice, hold_out)?;
         let context: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-        let groups = match *choice {
-            ContextChoice::Neighbours { num_views, num_groups } => {
-                let default = (GROUPS_PER_VIEW * frames.len() as f64).ceil() as usize;
-                neighbour_groups(&context, num_views, num_groups.unwrap_or(default))
-            }
-            _ => vec![(0..frames.len()).collect()],
+        let find = |views: &[Pose]| PoseNormalization::find(key, views, &[], data.pose_rotation, data.pose_scale);
+        let normalization = find(&context).map_err(DataError::from)?;
+        let ContextChoice::Neighbours { num_views, num_groups } = *choice else {
+            return Ok(Self { groups: vec![ContextGroup::of_all(frames.len())], frames, normalization });
         };
-        let normalization = PoseNormalization::find(key, &context, &[], data.pose_rotation, data.pose_scale)
-            .map_err(DataError::from)?;
-        Ok(Self { frames, groups, normalization })
+        let context: Vec<Pose> = context.into_iter().map(|pose| normalization.normalize(pose)).collect();
+        let default = (GROUPS_PER_VIEW * frames.len() as f64).ceil() as usize;
+        let groups = neighbour_groups(&context, num_views, num_groups.unwrap_or(default)).into_iter().map(|views| {
+            let poses: Vec<Pose> = views.iter().map(|&view| context[view]).collect();
+            // Views that turn in place have no scale of their own.
+            let frame = find(&poses).unwrap_or(PoseNormalization { mean_c2w: poses[0], scale: 1.0 });
+            ContextGroup { views: views.iter().map(|&view| view as u32).collect(), frame }
+        });
+        Ok(Self { groups: groups.collect(), frames, normalization })
     }
 
     /// Returns the number of members of all groups.
     pub fn num_members(&self) -> usize {
-        self.groups.iter().map(Vec::len).sum()
+        self.groups.iter().map(|group| group.views.len()).sum()
     }
 }
 

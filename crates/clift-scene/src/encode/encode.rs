@@ -7,7 +7,7 @@ use clift_model::{Clusters, Grouping, KMeans, ModelError, SceneClusters, TokenCo
 
 use crate::encode::contexts::{ContextChoice, Contexts};
 use crate::error::SceneError;
-use crate::scene::scene::Scene;
+use crate::scene::scene::{ContextGroup, Scene};
 
 /// Settings of [`encode`].
 #[derive(Clone, Debug, PartialEq)]
@@ -92,8 +92,12 @@ pub fn encode(
     let Contexts { frames, groups, normalization } =
         Contexts::choose(reader, scene, &options.context, options.hold_out)?;
     let views = ViewIndices { context: frames, target: Vec::new() };
-    let clip = reader.read(scene, &views)?;
-    let sizes: Vec<usize> = groups.iter().map(Vec::len).collect();
+    let mut clip = reader.read(scene, &views)?;
+    let cameras = reader.source.cameras(scene)?;
+    for (camera, &frame) in clip.context.cameras.iter_mut().zip(&views.context) {
+        camera.c2w = normalization.normalize(cameras[frame].c2w);
+    }
+    let sizes: Vec<usize> = groups.iter().map(|group| group.views.len()).collect();
     let counts = token_counts(model, [data.height, data.width], &sizes, options.stored_tokens)?;
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
 
@@ -125,7 +129,7 @@ pub fn encode(
         width: data.width,
         context: clip.context.cameras,
         context_frames: views.context.iter().map(|&frame| frame as u32).collect(),
-        groups: groups.iter().map(|group| group.iter().map(|&view| view as u32).collect()).collect(),
+        groups,
         world: normalization,
         token_ids,
         tokens,
@@ -207,13 +211,14 @@ fn encode_group(
     Ok(EncodedGroup { tokens: tokens.to_host()?, lift: lift_values, clusters })
 }
 
-/// Returns the views of a group.
-fn members(views: &ClipViews, group: &[usize]) -> ClipViews {
+/// Returns the views of a group, with cameras in its frame.
+fn members(views: &ClipViews, group: &ContextGroup) -> ClipViews {
     let len = views.height * views.width * 3;
+    let members = || group.views.iter().map(|&view| view as usize);
     ClipViews {
-        images: group.iter().flat_map(|&view| &views.images[view * len..][..len]).copied().collect(),
-        cameras: group.iter().map(|&view| views.cameras[view]).collect(),
-        frame_index: group.iter().map(|&view| views.frame_index[view]).collect(),
+        images: members().flat_map(|view| &views.images[view * len..][..len]).copied().collect(),
+        cameras: group.cameras(members().map(|view| views.cameras[view])),
+        frame_index: members().map(|view| views.frame_index[view]).collect(),
         ..*views
     }
 }

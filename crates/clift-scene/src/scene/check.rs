@@ -19,9 +19,11 @@ impl Scene {
         for (view, camera) in self.context.iter().enumerate() {
             check_camera(camera).map_err(|error| format!("context camera {view}: {error}"))?;
         }
-        self.world.mean_c2w.validate().map_err(|error| format!("mean pose: {error}"))?;
-        if !(self.world.scale > 0.0 && self.world.scale.is_finite()) {
-            return Err(format!("pose scale {}, expected a positive number", self.world.scale));
+        for frame in std::iter::once(&self.world).chain(self.groups.iter().map(|group| &group.frame)) {
+            frame.mean_c2w.validate().map_err(|error| format!("mean pose: {error}"))?;
+            if !(frame.scale > 0.0 && frame.scale.is_finite()) {
+                return Err(format!("pose scale {}, expected a positive number", frame.scale));
+            }
         }
         let is_hash = self.renderer_hash.len() == 64 && self.renderer_hash.bytes().all(|c| c.is_ascii_hexdigit());
         if !is_hash {
@@ -62,10 +64,12 @@ impl Scene {
     }
 
     fn check_groups(&self) -> Result<(), String> {
-        if self.groups.is_empty() || self.groups.iter().any(Vec::is_empty) || self.groups.len() > MAX_VIEWS {
+        let is_size = |count: usize| (1..=MAX_VIEWS).contains(&count);
+        if !is_size(self.groups.len()) || !self.groups.iter().all(|group| is_size(group.views.len())) {
             return Err(format!("{} groups of context views, expected 1 to {MAX_VIEWS} with views", self.groups.len()));
         }
-        if let Some(view) = self.groups.iter().flatten().find(|view| **view as usize >= self.context.len()) {
+        let mut views = self.groups.iter().flat_map(|group| &group.views);
+        if let Some(view) = views.find(|view| **view as usize >= self.context.len()) {
             return Err(format!("a group of context view {view}, expected less than {}", self.context.len()));
         }
         if self.groups.len() > 1 && !self.model.has_patch_tokens() {

@@ -11,6 +11,7 @@
 //! | for each context view: quaternion `x, y, z, w` and center of the pose, frame number | 7 x f32, u32 |
 //! | number of groups, their sizes, and the context views of the groups, one group after the other | u16 |
 //! | zero or two bytes 0, up to a multiple of four bytes | |
+//! | of several groups: the frame of each, as the normalization above | 4 x f32, 4 x f64 |
 //! | words of the entropy coder: token ids, then levels by direction | u32 |
 //! | CRC-32 of everything before | u32 |
 //!

@@ -5,6 +5,7 @@ use clift_core::{Camera, DMat3, Pose, PoseNormalization};
 use glam::DQuat;
 
 use crate::scene::read::split_groups;
+use crate::scene::scene::ContextGroup;
 
 /// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
 const WORLD_BYTES: usize = 4 * 4 + 4 * 8;
@@ -61,17 +62,22 @@ pub(crate) fn read_views(views: usize, bytes: &[u8]) -> Option<(Views, &[u8])> {
     Some((bytes.chunks_exact(VIEW_BYTES).enumerate().map(view).unzip(), rest))
 }
 
-/// Adds the number of groups, their sizes and their views, padded to words of four bytes.
-pub(crate) fn write_groups(groups: &[Vec<u32>], body: &mut Vec<u8>) {
+/// Adds the number of groups, their sizes and their views, padded to words of four bytes, and the frames of several groups: that
+/// of a single group is the frame of the scene.
+pub(crate) fn write_groups(groups: &[ContextGroup], body: &mut Vec<u8>) {
     let start = body.len();
-    let sizes = groups.iter().map(|group| group.len() as u32);
-    let numbers = std::iter::once(groups.len() as u32).chain(sizes).chain(groups.concat());
+    let sizes = groups.iter().map(|group| group.views.len() as u32);
+    let views = groups.iter().flat_map(|group| group.views.iter().copied());
+    let numbers = std::iter::once(groups.len() as u32).chain(sizes).chain(views);
     body.extend(numbers.flat_map(|number| (number as u16).to_le_bytes()));
     body.resize(start + (body.len() - start).next_multiple_of(4), 0);
+    if groups.len() > 1 {
+        groups.iter().for_each(|group| write_world(&group.frame, body));
+    }
 }
 
 /// Reads groups; returns them and the rest of the bytes. `None` if there are too few bytes.
-pub(crate) fn read_groups(bytes: &[u8]) -> Option<(Vec<Vec<u32>>, &[u8])> {
+pub(crate) fn read_groups(bytes: &[u8]) -> Option<(Vec<ContextGroup>, &[u8])> {
     let numbers = |bytes: &[u8]| -> Vec<u32> {
         bytes.as_chunks().0.iter().map(|number| u32::from(u16::from_le_bytes(*number))).collect()
     };
@@ -81,7 +87,18 @@ pub(crate) fn read_groups(bytes: &[u8]) -> Option<(Vec<Vec<u32>>, &[u8])> {
     let members: usize = sizes.iter().map(|&size| size as usize).sum();
     let (views, _) = rest.split_at_checked(2 * members)?;
     let end = (2 * (1 + sizes.len() + members)).next_multiple_of(4);
-    Some((split_groups(&sizes, &numbers(views)).ok()?, bytes.get(end..)?))
+    let mut rest = bytes.get(end..)?;
+    let groups = split_groups(&sizes, &numbers(views)).ok()?;
+    if let [views] = &groups[..] {
+        return Some((vec![ContextGroup { views: views.clone(), ..ContextGroup::of_all(0) }], rest));
+    }
+    let mut framed = Vec::with_capacity(groups.len());
+    for views in groups {
+        let (frame, others) = read_world(rest)?;
+        framed.push(ContextGroup { views, frame });
+        rest = others;
+    }
+    Some((framed, rest))
 }
 
 /// Returns the pose of a quaternion and a center. That of damaged numbers contains NaN, which the check of the scene finds.

@@ -10,7 +10,7 @@ use crate::codec::token_codec::TokenCodec;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
-use crate::scene::scene::{CODED_VERSION, FORMAT, Scene, VERSION, dtype_name};
+use crate::scene::scene::{CODED_VERSION, ContextGroup, FORMAT, Scene, VERSION, dtype_name};
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
 use crate::tensors::Tensors;
@@ -107,7 +107,13 @@ fn from_bytes(
     let (format, num_tokens, tokens) = tensors.tokens(&model)?;
     let views = tensors.length("context_frames")?;
     let indices = |name| tensors.u32s(name, &[tensors.length(name)?]);
-    let groups = split_groups(&indices("group_sizes")?, &indices("group_views")?)?;
+    let views_of_groups = split_groups(&indices("group_sizes")?, &indices("group_views")?)?;
+    let num_groups = views_of_groups.len();
+    let frames = tensors.f64s("group_mean_c2w", &[num_groups, 4, 4])?;
+    let scales = tensors.f64s("group_scale", &[num_groups])?;
+    let frames = frames.as_chunks().0.iter().zip(&scales).map(|(mean, &scale)| normalization(mean, scale));
+    let groups =
+        views_of_groups.into_iter().zip(frames).map(|(views, frame)| Ok(ContextGroup { views, frame: frame? }));
     let poses = tensors.f64s("context_c2w", &[views, 4, 4])?;
     let intrinsics = tensors.f64s("context_intrinsics", &[views, 4])?;
     let cameras = poses.as_chunks().0.iter().zip(intrinsics.as_chunks::<4>().0).enumerate();
@@ -117,7 +123,6 @@ fn from_bytes(
     });
     let mut mean_c2w = [0.0; 16];
     mean_c2w.copy_from_slice(&tensors.f64s("world_mean_c2w", &[4, 4])?);
-    let mean_c2w = Pose::from_matrix(&mean_c2w).map_err(|error| format!("mean pose: {error}"))?;
     let scene = Scene {
         key: fields.get("key")?.into(),
         kind,
@@ -127,8 +132,8 @@ fn from_bytes(
         width: fields.count("width")?,
         context: cameras.collect::<Result<_, String>>()?,
         context_frames: tensors.u32s("context_frames", &[views])?,
-        groups,
-        world: PoseNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
+        groups: groups.collect::<Result<_, String>>()?,
+        world: normalization(&mean_c2w, tensors.f64s("world_scale", &[1])?[0])?,
         token_ids: if model.has_patch_tokens() {
             tensors.u32s("token_ids", &[num_tokens])?
         } else {
@@ -142,6 +147,12 @@ fn from_bytes(
         check_rays(&scene, &tensors.f32s("token_rays", &[num_tokens, 6])?)?;
     }
     Ok((scene, format.into()))
+}
+
+/// Returns a normalization from its matrix; the check of the scene checks the scale.
+fn normalization(mean_c2w: &[f64; 16], scale: f64) -> Result<PoseNormalization, String> {
+    let mean_c2w = Pose::from_matrix(mean_c2w).map_err(|error| format!("mean pose: {error}"))?;
+    Ok(PoseNormalization { mean_c2w, scale })
 }
 
 /// Splits the members of all groups by the sizes of the groups.
@@ -199,7 +210,7 @@ impl Tensors<'_> {
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));
         let format = format.ok_or_else(|| format!("`tokens` is {dtype:?}, expected F32, F16 or I8"))?;
         let places = if model.has_patch_tokens() { 2 } else { 0 };
-        let expected = 8 + places + usize::from(format == TokenFormat::Int8);
+        let expected = 10 + places + usize::from(format == TokenFormat::Int8);
         if self.0.len() != expected {
             return Err(format!("{} tensors, expected {expected}", self.0.len()));
         }

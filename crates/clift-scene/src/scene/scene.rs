@@ -11,8 +11,9 @@
 //! | `context_intrinsics`: `fx, fy, cx, cy` in pixels | F64 | `[views, 4]` |
 //! | `group_sizes`: number of context views of each group that was encoded together | U32 | `[groups]` |
 //! | `group_views`: context views of the groups, one group after the other | U32 | `[members]` |
+//! | `group_mean_c2w`, `group_scale`: the frame of each group, as `world_mean_c2w` of normalized poses | F64 | `[groups, 4, 4]`, `[groups]` |
 //! | `world_mean_c2w`, `world_scale`: the normalization of poses | F64 | `[4, 4]`, `[1]` |
-//! | `token_rays`: `[moment, direction]` through the center of a token's patch, not of learned tokens | F32 | `[tokens, 6]` |
+//! | `token_rays`: `[moment, direction]` through the center of a token's patch in the frame of its group, not of learned tokens | F32 | `[tokens, 6]` |
 //! | `token_scales`, with `int8` tokens only | F32 | `[tokens]` |
 //! | `context_frames`: frame number of each view in the capture | U32 | `[views]` |
 //! | `token_ids`: patch of the members of all groups of each token, not of learned tokens | U32 | `[tokens]` |
@@ -23,7 +24,7 @@
 //! relative to the folder of the file or absolute), `height` and `width` of the context views.
 // S storage tokens, V context views, G groups, M members of all groups, D width
 
-use clift_core::{Camera, PoseNormalization};
+use clift_core::{Camera, Pose, PoseNormalization};
 use clift_model::{ModelConfig, TokenKind, TokenRay};
 
 use crate::scene::token_format::TokenFormat;
@@ -59,8 +60,8 @@ pub struct Scene {
     pub context: Vec<Camera>,
     /// Frame number of each context view in the capture.
     pub context_frames: Vec<u32>,
-    /// Groups of context views that were encoded together, as positions in `context`. A view may be a member of several.
-    pub groups: Vec<Vec<u32>>,
+    /// Groups of context views that were encoded together.
+    pub groups: Vec<ContextGroup>,
     /// Normalization of the poses: its frame has the context cameras.
     pub world: PoseNormalization,
     /// Patch of each token, `[S]`: `member * rows * columns + row * columns + column`, where members are counted over all
@@ -70,32 +71,52 @@ pub struct Scene {
     pub tokens: Vec<f32>,
 }
 
+/// Context views that were encoded together. Their tokens know the cameras in a frame of the group, as in training.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ContextGroup {
+    /// Positions in [`Scene::context`]. A view may be a member of several groups.
+    pub views: Vec<u32>,
+    /// The normalization of the group's cameras, of poses that [`Scene::world`] has normalized.
+    pub frame: PoseNormalization,
+}
+
+impl ContextGroup {
+    /// Returns the group of all of `num_views` context views, whose frame is that of the scene.
+    pub fn of_all(num_views: usize) -> Self {
+        Self {
+            views: (0..num_views as u32).collect(),
+            frame: PoseNormalization { mean_c2w: Pose::IDENTITY, scale: 1.0 },
+        }
+    }
+
+    /// Maps cameras of the scene to the frame of the group.
+    pub fn cameras(&self, cameras: impl IntoIterator<Item = Camera>) -> Vec<Camera> {
+        let map = |camera: Camera| Camera { c2w: self.frame.normalize(camera.c2w), ..camera };
+        cameras.into_iter().map(map).collect()
+    }
+}
+
 impl Scene {
     /// Returns the number of tokens.
     pub fn num_tokens(&self) -> usize {
         self.token_ids.len()
     }
 
-    /// Returns a single group of all of `num_views` context views.
-    pub fn single_group(num_views: usize) -> Vec<Vec<u32>> {
-        vec![(0..num_views as u32).collect()]
-    }
-
-    /// Returns the cameras of the members of all groups, `[M]`.
-    pub fn members(&self) -> Vec<Camera> {
-        self.groups.iter().flatten().map(|&view| self.context[view as usize]).collect()
+    /// Returns the cameras of a group in its frame.
+    pub fn group_cameras(&self, group: &ContextGroup) -> Vec<Camera> {
+        group.cameras(group.views.iter().map(|&view| self.context[view as usize]))
     }
 
     /// Returns the number of members of all groups.
     pub fn num_members(&self) -> usize {
-        self.groups.iter().map(Vec::len).sum()
+        self.groups.iter().map(|group| group.views.len()).sum()
     }
 
     /// Returns the positions of every group's tokens, ascending. Learned tokens belong to the only group.
     pub fn tokens_of_groups(&self) -> Vec<Vec<u32>> {
         let patches = self.height / self.model.patch_size * (self.width / self.model.patch_size);
         let of_member: Vec<usize> =
-            self.groups.iter().enumerate().flat_map(|(group, views)| vec![group; views.len()]).collect();
+            self.groups.iter().enumerate().flat_map(|(i, group)| vec![i; group.views.len()]).collect();
         let mut tokens = vec![Vec::new(); self.groups.len()];
         for (token, &id) in self.token_ids.iter().enumerate() {
             let group = if self.groups.len() == 1 { 0 } else { of_member[id as usize / patches] };
@@ -109,13 +130,14 @@ impl Scene {
         self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default()
     }
 
-    /// Returns the ray of every token, through the center of its patch; none of learned tokens.
+    /// Returns the ray of every token in the frame of its group, through the center of its patch; none of learned tokens.
     ///
     /// # Shapes
     /// - returns `[num_tokens]`, or `[0]`
     pub fn token_rays(&self) -> Vec<TokenRay> {
         let ids = if self.model.has_patch_tokens() { &self.token_ids[..] } else { &[] };
-        TokenRay::of_patches(ids, &self.members(), self.height, self.width, self.model.patch_size)
+        let members: Vec<Camera> = self.groups.iter().flat_map(|group| self.group_cameras(group)).collect();
+        TokenRay::of_patches(ids, &members, self.height, self.width, self.model.patch_size)
     }
 
     /// Returns `[moment, direction]` of every token's ray.
@@ -134,7 +156,7 @@ impl Scene {
     }
 }
 
-/// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + 4 G + 4 M + S (28 + D b)` for V context views, G
+/// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + 140 G + 4 M + S (28 + D b)` for V context views, G
 /// groups of M members and S tokens of width D with b bytes per value, and four more bytes per token for `int8`. Learned
 /// tokens have neither ray nor patch, 28 bytes less.
 pub fn scene_file_bytes(
@@ -145,12 +167,12 @@ pub fn scene_file_bytes(
 ) -> u64 {
     // Pose and intrinsics in f64, and a frame number.
     let view = (16 + 4) * 8 + 4;
-    let world = (16 + 1) * 8;
+    let frame = (16 + 1) * 8;
     // A ray of six f32, and the index of a patch.
     let place = if model.has_patch_tokens() { 6 * 4 + 4 } else { 0 };
     let token = place + format.bytes_per_token(model.dim);
-    let groups = 4 * (num_groups + num_members);
-    (8 + HEADER_BYTES + world + num_views * view + groups + num_tokens * token) as u64
+    let groups = num_groups * (frame + 4) + num_members * 4;
+    (8 + HEADER_BYTES + frame + num_views * view + groups + num_tokens * token) as u64
 }
 
 /// Returns the safetensors type of tokens.

@@ -11,7 +11,7 @@ use clift_model::{
     interleaved, open_renderer, phases, render_bytes, renderer_hash,
 };
 
-use crate::scene::scene::Scene;
+use crate::scene::scene::{ContextGroup, Scene};
 
 /// Most frames of one call with all tokens, where frames share keys and values.
 const FRAMES_PER_CALL: usize = 8;
@@ -76,6 +76,8 @@ pub struct SceneRenderer {
 /// The tokens of context views that were encoded together.
 #[derive(Clone, Debug)]
 struct TokenGroup {
+    context: ContextGroup,
+    /// Poses of the context views in the scene.
     views: Vec<Pose>,
     /// Positions of the tokens in the scene.
     tokens: Vec<u32>,
@@ -94,21 +96,21 @@ impl SceneRenderer {
         let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
         let mut groups = Vec::with_capacity(scene.groups.len());
         let mut first_patch = 0;
-        for (views, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
+        for (group, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
             let rows = tokens.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
             let values = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, tokens.len(), dim]);
-            let context: Vec<Camera> = views.iter().map(|&view| scene.context[view as usize]).collect();
-            let cameras = Cameras::of_views(&context, scene.height, scene.width, device)?;
+            let cameras = Cameras::of_views(&scene.group_cameras(group), scene.height, scene.width, device)?;
             let patches: Vec<u32> = tokens.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
             let values = Tensor::from_data(values, device);
             let rays: Vec<TokenRay> = tokens.iter().filter_map(|&token| rays.get(token as usize)).copied().collect();
             groups.push(TokenGroup {
-                views: context.iter().map(|camera| camera.c2w).collect(),
+                views: group.views.iter().map(|&view| scene.context[view as usize].c2w).collect(),
+                context: group.clone(),
                 cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
                 selector: Selector::new(rules, &rays)?,
                 tokens,
             });
-            first_patch += (views.len() * patches_per_view) as u32;
+            first_patch += (group.views.len() * patches_per_view) as u32;
         }
         let context: Vec<Pose> = scene.context.iter().map(|camera| camera.c2w).collect();
         Ok(Self {
@@ -208,6 +210,7 @@ impl SceneRenderer {
         let started = Instant::now();
         let num_groups = self.groups.len();
         let tokens = &mut self.groups[group];
+        let views = &tokens.context.cameras(views.iter().copied())[..];
         let selected = match num_render_tokens {
             Some(count) => Some(tokens.selector.select(&views[0], size[0], size[1], count)?),
             None => None,
@@ -264,8 +267,12 @@ fn blend_shares(distances: &[f64]) -> Vec<(usize, f64)> {
     let mut order: Vec<usize> = (0..distances.len()).collect();
     order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]));
     let Some(&nearest) = order.first() else { return Vec::new() };
-    let limit = distances[nearest] + BLEND;
-    let limit = order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]));
+    let limit = distances[nearest] + std::env::var("BL").ok().and_then(|v| v.parse().ok()).unwrap_or(BLEND);
+    let limit = if std::env::var("CAP").is_ok() {
+        limit
+    } else {
+        order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]))
+    };
     let rooms = order.into_iter().take(MAX_BLENDED).map(|group| (group, limit - distances[group]));
     let mut near: Vec<(usize, f64)> = rooms.filter(|(_, room)| *room > 0.0).collect();
     if near.is_empty() {

@@ -72,8 +72,9 @@ impl Scene {
         self.check().map_err(refuse)?;
         let (tokens, scales) = format.encode(&self.tokens, self.model.dim)?;
         let (count, views) = (self.num_tokens(), self.context.len());
-        let sizes: Vec<u32> = self.groups.iter().map(|group| group.len() as u32).collect();
-        let members = self.groups.concat();
+        let sizes: Vec<u32> = self.groups.iter().map(|group| group.views.len() as u32).collect();
+        let members: Vec<u32> = self.groups.iter().flat_map(|group| group.views.clone()).collect();
+        let frames = || self.groups.iter().map(|group| group.frame);
         let f64_bytes = |values: &mut dyn Iterator<Item = f64>| values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>();
         let f32_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
         let u32_bytes = |values: &[u32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
@@ -93,6 +94,13 @@ impl Scene {
             ),
             ("world_mean_c2w", "F64", vec![4, 4], f64_bytes(&mut self.world.mean_c2w.to_matrix_f64().into_iter())),
             ("world_scale", "F64", vec![1], f64_bytes(&mut [self.world.scale].into_iter())),
+            (
+                "group_mean_c2w",
+                "F64",
+                vec![sizes.len(), 4, 4],
+                f64_bytes(&mut frames().flat_map(|frame| frame.mean_c2w.to_matrix_f64())),
+            ),
+            ("group_scale", "F64", vec![sizes.len()], f64_bytes(&mut frames().map(|frame| frame.scale))),
         ];
         let has_places = self.model.has_patch_tokens();
         if has_places {

@@ -88,7 +88,7 @@ impl OpenScene {
             bytes: origin.file_bytes,
             tokens: format!("{}, {}", scene.kind, origin.coding),
             renderable: self.renderer.max_render_tokens(),
-            members: scene.groups.concat(),
+            members: scene.groups.iter().flat_map(|group| group.views.clone()).collect(),
             token_ids: &scene.token_ids,
             clusters: origin.clusters.as_deref(),
             context: context_frames.map(|(camera, &frame)| scene_camera(frame as usize, camera, size)).collect(),

@@ -19,6 +19,8 @@ use crate::output::units::file_size;
 
 /// Most frames of a list.
 const MAX_LISTED: usize = 8;
+/// Most held-out frames with a line of their own.
+const MAX_LISTED_CHECKS: usize = 16;
 
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
@@ -171,6 +173,10 @@ fn print(written: &WrittenScene, out: &Path, model: &Path) -> anyhow::Result<()>
             let mean = |value: fn(&CheckedView) -> f64| {
                 clift_core::mean(&views.iter().map(value).collect::<Vec<_>>()).unwrap_or_default()
             };
+            for view in views.iter().take(MAX_LISTED_CHECKS) {
+                let name = written.frame_name(view.frame);
+                print_result(&format!("  {name}: {:.2} dB, nearest context {:.2} dB", view.psnr, view.baseline_psnr))?;
+            }
             print_result(&format!(
                 "check: {} frames held out: {:.2} dB rendered, {:.2} dB copied from the nearest context; {} rendered better",
                 views.len(),

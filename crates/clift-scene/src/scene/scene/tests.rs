@@ -29,7 +29,7 @@ pub(crate) fn scene() -> Scene {
         width: 24,
         context: vec![camera(-1.0, 0.2), camera(1.0, -0.3)],
         context_frames: vec![3, 41],
-        groups: Scene::single_group(2),
+        groups: vec![ContextGroup::of_all(2)],
         world: PoseNormalization { mean_c2w: camera(17.0, 1.0).c2w, scale: 0.1 + 0.2 },
         tokens: (0..token_ids.len() * DIM).map(|i| (i as f32 - 17.0) * 0.317).collect(),
         token_ids,
