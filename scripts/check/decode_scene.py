@@ -1,4 +1,4 @@
-"""Decodes a scene file with coded tokens (version 5), as docs/reference/files.md describes it.
+"""Decodes a scene file with coded tokens (version 7), as docs/reference/files.md describes it.
 
 usage: decode_scene.py SCENE.clift CODEC.safetensors [--write FILE | --check FILE]
 
@@ -84,14 +84,17 @@ def neighbours(ids, rows, columns):
 def decode(scene_path, codec_path):
     data, fields, scene = open_safetensors(scene_path)
     _, info, codec = open_safetensors(codec_path)
-    assert fields["version"] == "5" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
+    assert fields["version"] == "7" and zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0], "damaged"
     body, count = scene["scene"].tobytes(), int(fields["tokens"])
     patch, (views, height, width) = json.loads(info["model"])["patch_size"], map(int, fields["views"].split("x"))
     rows, columns = height // patch, width // patch
-    patches = views * rows * columns
     step = float(np.frombuffer(body[:4], "<f4")[0])
     (num_intrinsics,) = struct.unpack_from("<I", body, 4 + 48)
     start = 4 + 48 + 4 + 16 * num_intrinsics + 32 * views
+    (groups,) = struct.unpack_from("<H", body, start)
+    members = sum(struct.unpack_from(f"<{groups}H", body, start + 2))
+    patches = members * rows * columns
+    start += -(-2 * (1 + groups + members) // 4) * 4 + (48 * groups if groups > 1 else 0)
     decoder = Decoder(np.frombuffer(body[start:-4], "<u4").tolist())
     ids = []
     for index in range(patches):

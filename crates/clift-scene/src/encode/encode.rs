@@ -16,7 +16,8 @@ pub struct EncodeOptions {
     pub context: ContextChoice,
     /// One of this many frames is not a context view, 0 for none.
     pub hold_out: usize,
-    /// Number of stored tokens of all groups; `None` for a quarter, or all tokens of a network without clusters.
+    /// Number of stored tokens of all groups; `None` for a quarter, down to an eighth
+    /// of many groups, or for all tokens of a network without clusters.
     pub stored_tokens: Option<TokenCount>,
     /// Token groups that the model was trained on.
     pub grouping: Grouping,
@@ -138,6 +139,13 @@ pub fn encode(
     Ok(EncodedScene { scene, num_lift_tokens: clusters.assignment().len(), cluster_error, clusters })
 }
 
+/// Returns the share of all tokens that is stored by default: a quarter, of a place with many groups fewer for a file of at most
+/// 400 kB, but an eighth.
+fn default_share(num_tokens: usize) -> f64 {
+    const MOST: f64 = 7680.0;
+    (MOST / num_tokens as f64).clamp(0.125, 0.25)
+}
+
 /// Returns the number of stored tokens of every group of `sizes` views: a share of its tokens, or an equal part of a number.
 fn token_counts(
     model: &TrainedModel,
@@ -158,7 +166,7 @@ fn token_counts(
             _ => Ok(all),
         };
     }
-    match stored_tokens.unwrap_or(TokenCount::Share(0.25)) {
+    match stored_tokens.unwrap_or(TokenCount::Share(default_share(sum))) {
         share @ TokenCount::Share(_) => all.iter().map(|&all| share.of(all)).collect(),
         count @ TokenCount::Count(_) => {
             let (count, groups) = (count.of(sum)?, sizes.len());
@@ -220,5 +228,35 @@ fn members(views: &ClipViews, group: &ContextGroup) -> ClipViews {
         cameras: group.cameras(members().map(|view| views.cameras[view])),
         frame_index: members().map(|view| views.frame_index[view]).collect(),
         ..*views
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Device;
+    use clift_model::{Clift, ModelConfig};
+
+    use super::*;
+
+    #[test]
+    fn groups_have_equal_parts_of_a_number_of_tokens_or_a_share_each() {
+        let config = ModelConfig {
+            dim: 16,
+            num_heads: 2,
+            feed_forward_dim: 24,
+            num_encoder_blocks: 1,
+            ..ModelConfig::default()
+        };
+        let network = Clift::new(&config, 3, &Device::flex());
+        let model = TrainedModel { network, config, has_condenser: true, device: Device::flex() };
+        // Views of 2 x 3 patches.
+        let counts =
+            |sizes: &[usize], stored| token_counts(&model, [16, 24], sizes, stored).map_err(|error| error.to_string());
+        assert_eq!(counts(&[4, 4, 2], None).unwrap(), [6, 6, 3]);
+        assert_eq!(counts(&[4, 4, 4], Some(TokenCount::Count(20))).unwrap(), [6, 7, 7]);
+        assert_eq!(counts(&[4, 1], Some(TokenCount::Count(30))).unwrap(), [15, 6], "no more than the group has");
+        assert_eq!([1024, 40_000, 100_000].map(default_share), [0.25, 0.192, 0.125]);
+        let message = counts(&[2, 2, 2], Some(TokenCount::Count(2))).unwrap_err();
+        assert!(message.contains("the scene has 3 groups of views"), "{message}");
     }
 }

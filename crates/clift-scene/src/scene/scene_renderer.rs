@@ -267,12 +267,8 @@ fn blend_shares(distances: &[f64]) -> Vec<(usize, f64)> {
     let mut order: Vec<usize> = (0..distances.len()).collect();
     order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]));
     let Some(&nearest) = order.first() else { return Vec::new() };
-    let limit = distances[nearest] + std::env::var("BL").ok().and_then(|v| v.parse().ok()).unwrap_or(BLEND);
-    let limit = if std::env::var("CAP").is_ok() {
-        limit
-    } else {
-        order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]))
-    };
+    let limit = distances[nearest] + BLEND;
+    let limit = order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]));
     let rooms = order.into_iter().take(MAX_BLENDED).map(|group| (group, limit - distances[group]));
     let mut near: Vec<(usize, f64)> = rooms.filter(|(_, room)| *room > 0.0).collect();
     if near.is_empty() {
@@ -306,7 +302,7 @@ mod tests {
     use clift_model::{CameraEncoding, Clift, SelectionPreset, save_weights};
 
     use super::*;
-    use crate::scene::scene::tests::{camera, scene};
+    use crate::scene::scene::tests::{camera, scene, scene_of_groups};
     use crate::testing::devices;
 
     fn config() -> ModelConfig {
@@ -375,6 +371,67 @@ mod tests {
             }
             for &preset in SelectionPreset::ALL {
                 assert_equals_single_frames(&Device::flex(), &config, preset, 5, 0.0);
+            }
+        }
+    }
+
+    /// The scene of two groups with all its 24 patches, on views of 24 x 16 pixels.
+    fn grouped_scene(renderer: &Renderer, config: &ModelConfig) -> Scene {
+        let tokens = (0..24 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
+        let renderer_hash = renderer_hash(renderer, config);
+        let token_ids = (0..24).collect();
+        Scene { model: config.clone(), renderer_hash, tokens, token_ids, ..scene_of_groups() }
+    }
+
+    #[test]
+    fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
+        let device = Device::flex();
+        for config in CameraEncoding::ALL.map(encoded) {
+            let renderer = Clift::new(&config, 3, &device).renderer;
+            let scene = grouped_scene(&renderer, &config);
+            let rules = SelectionPreset::Paper.rules();
+            let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
+            for (group, view) in [(0, scene.context[0]), (1, scene.context[2])] {
+                // The group alone, in its frame.
+                let ContextGroup { views, frame } = &scene.groups[group];
+                let alone = Scene {
+                    context: scene.group_cameras(&scene.groups[group]),
+                    context_frames: vec![0; views.len()],
+                    groups: vec![ContextGroup::of_all(views.len())],
+                    token_ids: (0..12).collect(),
+                    tokens: scene.tokens[group * 12 * 16..][..12 * 16].to_vec(),
+                    ..scene.clone()
+                };
+                let mut alone = SceneRenderer::new(&alone, renderer.clone(), rules, &device).unwrap();
+                for count in [5, 12] {
+                    let expected = Camera { c2w: frame.normalize(view.c2w), ..view };
+                    let expected = alone.render(&[expected], 16, 24, count).unwrap().remove(0);
+                    let got = whole.render(&[view], 16, 24, count).unwrap().remove(0);
+                    assert_eq!(got.pixels, expected.pixels, "group {group}, {count} tokens");
+                    assert_eq!(got.tokens.unwrap().len(), count);
+                    (alone.reset(), whole.reset());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn shares_of_groups_add_up_and_change_continuously() {
+        assert_eq!(blend_shares(&[0.7]), [(0, 1.0)]);
+        assert_eq!(blend_shares(&[0.9, 0.2]), [(1, 1.0)], "far beyond the nearest");
+        assert_eq!(blend_shares(&[0.5, 0.5]), [(0, 0.5), (1, 0.5)]);
+        assert_eq!(blend_shares(&[0.5; 4]), [(0, 1.0)], "no room before the next after the most groups");
+        let share = |distances: &[f64], group: usize| {
+            blend_shares(distances).iter().find(|(other, _)| *other == group).map_or(0.0, |(_, share)| *share)
+        };
+        // Two groups swap places, a third comes and goes.
+        for step in 0..1000 {
+            let at = |step: i32| [f64::from(step) * 1e-3, 1.0 - f64::from(step) * 1e-3, 0.4, 0.45];
+            let sum: f64 = (0..4).map(|group| share(&at(step), group)).sum();
+            assert!((sum - 1.0).abs() < 1e-12, "step {step}: {sum}");
+            for group in 0..4 {
+                let jump = (share(&at(step), group) - share(&at(step + 1), group)).abs();
+                assert!(jump < 0.05, "group {group} jumps by {jump} at step {step}");
             }
         }
     }

@@ -64,6 +64,8 @@ pub struct EncodeArgs {
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = parse_hold_out)]
     pub hold_out: usize,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
+    ///
+    /// Of a place with many groups the default falls to 1/8, for a file of at most about 400 kB.
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
     /// Format of the tokens: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]

@@ -7,7 +7,7 @@ use safetensors::SafeTensors;
 
 use super::*;
 use crate::codec::token_codec::tests::codec;
-use crate::scene::scene::tests::{scene, with_header};
+use crate::scene::scene::tests::{scene, scene_of_groups, with_header};
 
 const STEP: f32 = 0.25;
 
@@ -125,7 +125,7 @@ fn hostile_files_with_valid_checksums_are_refused() {
         (hash.as_str(), "0123456789abcdef", "the scene was coded with the codec 0123456789abcdef"),
         ("\"codec\"", "\"coder\"", "no `codec` in the header"),
         ("\"scene\":{", "\"scenf\":{", "no tensor `scene`"),
-        ("\"version\":\"5\"", "\"version\":\"6\"", "scene file of version 6, this clift reads versions 2 and 5"),
+        ("\"version\":\"7\"", "\"version\":\"8\"", "scene file of version 8, this clift reads versions 6 and 7"),
     ] {
         let message = folder.refusal_of(&checked(with_header(&bytes, &[(from, to)])));
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
@@ -199,6 +199,35 @@ fn views_come_back_with_shared_and_with_different_intrinsics() {
         sizes.push(std::fs::metadata(folder.path()).unwrap().len());
     }
     assert_eq!(sizes[1], sizes[0] + 16);
+}
+
+#[test]
+fn groups_come_back_with_their_frames() {
+    let folder = Folder::new();
+    let original = scene_of_groups();
+    original.write_coded(&folder.path(), &folder.1, STEP).unwrap();
+    let (back, _) = Scene::read(&folder.path()).unwrap();
+    assert_same_views(&back, &original);
+    assert_eq!(back.tokens_of_groups(), original.tokens_of_groups());
+    for (got, expected) in back.groups.iter().zip(&original.groups) {
+        assert_eq!((&got.views, got.frame.scale), (&expected.views, expected.frame.scale));
+        let [got, expected] = [got, expected].map(|group| group.frame.mean_c2w.to_matrix_f64());
+        assert!(got.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6), "{got:?}");
+    }
+    let bytes = std::fs::read(folder.path()).unwrap();
+    let start = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let groups = start + 4 + 48 + 4 + 16 + 3 * 32;
+    for (at, value, expected) in [
+        (0, 0_u16, "3 views and coded tokens"),
+        (0, u16::MAX, "3 views and coded tokens"),
+        (2, 1, "3 views and coded tokens"),
+        (6, 3, "a group of context view 3, expected less than 3"),
+    ] {
+        let mut damaged = bytes.clone();
+        damaged[groups + at..][..2].copy_from_slice(&value.to_le_bytes());
+        let message = folder.refusal_of(&checked(damaged));
+        assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
+    }
 }
 
 fn assert_same_views(got: &Scene, expected: &Scene) {

@@ -88,7 +88,7 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
     let folder = Folder::new();
     for format in TokenFormat::ALL {
         let bytes = folder.bytes(format);
-        let expected = 8 + 2048 + 136 + 164 * 2 + 5 * (28 + format.bytes_per_token(DIM));
+        let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * (28 + format.bytes_per_token(DIM));
         assert_eq!((bytes.len(), scene().file_bytes(format)), (expected, expected as u64), "{format}");
         let (back, found) = Scene::read(&folder.path()).expect("reads");
         assert_eq!(found, format.into());
@@ -99,6 +99,42 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
     assert_eq!(std::fs::read_dir(folder.0.path()).expect("a folder").count(), 1, "no temporary file is left");
 }
 
+/// Six tokens of two groups of two of three views; the second group has a frame of its own.
+pub(crate) fn scene_of_groups() -> Scene {
+    let frame = PoseNormalization { mean_c2w: camera(0.4, -0.1).c2w, scale: 2.5 };
+    let token_ids = vec![0, 3, 11, 12, 20, 23];
+    Scene {
+        context: vec![camera(-1.0, 0.2), camera(0.3, 0.0), camera(1.0, -0.3)],
+        context_frames: vec![3, 17, 41],
+        groups: vec![
+            ContextGroup { views: vec![0, 1], ..ContextGroup::of_all(0) },
+            ContextGroup { views: vec![1, 2], frame },
+        ],
+        tokens: (0..token_ids.len() * DIM).map(|i| (i as f32 - 17.0) * 0.317).collect(),
+        token_ids,
+        ..scene()
+    }
+}
+
+#[test]
+fn groups_survive_a_file_and_own_the_tokens_of_their_views() {
+    let folder = Folder::new();
+    let scene = scene_of_groups();
+    scene.write(&folder.path(), TokenFormat::F32).expect("writes");
+    let bytes = std::fs::metadata(folder.path()).expect("a file").len();
+    assert_eq!(bytes, scene.file_bytes(TokenFormat::F32));
+    assert_eq!(Scene::read(&folder.path()).expect("reads").0, scene);
+    assert_eq!(scene.tokens_of_groups(), [vec![0, 1, 2], vec![3, 4, 5]]);
+    // Token 3 is patch 12: the first of the first view of the second group, in the frame of that group.
+    let c2w = scene.groups[1].frame.normalize(scene.context[1].c2w);
+    let expected = Camera { c2w, ..scene.context[1] }.direction(4.0, 4.0);
+    assert_eq!(scene.token_rays()[3].origin, c2w.translation);
+    assert!(scene.token_rays()[3].direction.abs_diff_eq(expected, 1e-12));
+    let learned = Scene { model: small_lvsm(), kind: TokenKind::All, ..scene };
+    let message = folder.write_error(&learned, "learned", TokenFormat::F32);
+    assert!(message.contains("2 groups of learned tokens, expected one"), "{message}");
+}
+
 #[test]
 fn latents_are_stored_without_places() {
     let folder = Folder::new();
@@ -107,7 +143,7 @@ fn latents_are_stored_without_places() {
     for format in TokenFormat::ALL {
         latents.write(&folder.path(), format).expect("writes");
         let bytes = std::fs::read(folder.path()).expect("reads");
-        let expected = 8 + 2048 + 136 + 164 * 2 + 5 * format.bytes_per_token(DIM);
+        let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * format.bytes_per_token(DIM);
         assert_eq!((bytes.len(), latents.file_bytes(format)), (expected, expected as u64), "{format}");
         let tokens = format.round(&latents.tokens, DIM).expect("in range");
         assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..latents.clone() }, format.into()));
@@ -183,9 +219,9 @@ fn invalid_headers_are_refused() {
         (r#""format":"clift-scene""#, r#""format":"clift-1""#, "its header lacks the scene format; give a file"),
         (r#"{"__metadata__""#, r#"{"__metadata__"#, unreadable),
         (
-            r#""version":"2""#,
+            r#""version":"6""#,
             r#""version":"9""#,
-            "scene file of version 9, this clift reads versions 2 and 5; encode the scene again, or render it with",
+            "scene file of version 9, this clift reads versions 6 and 7; encode the scene again, or render it with",
         ),
         (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
         (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number"#),
@@ -264,6 +300,11 @@ fn invalid_tensor_values_are_refused() {
         (f32, "world_mean_c2w", 8, &f64_nan, "mean pose: bad camera: the pose holds NaN"),
         (f32, "world_scale", 0, &f64_nan, "pose scale NaN"),
         (f32, "world_scale", 0, &0.0_f64.to_le_bytes(), "pose scale 0"),
+        (f32, "group_sizes", 0, &1_u32.to_le_bytes(), "1 views after the last group"),
+        (f32, "group_sizes", 0, &3_u32.to_le_bytes(), "group 0 has 3 views, 2 are left of 2"),
+        (f32, "group_views", 4, &2_u32.to_le_bytes(), "a group of context view 2, expected less than 2"),
+        (f32, "group_scale", 0, &0.0_f64.to_le_bytes(), "pose scale 0"),
+        (f32, "group_mean_c2w", 0, &f64_nan, "mean pose: bad camera: the pose holds NaN"),
         (f32, "token_ids", 4, &12_u32.to_le_bytes(), "token 1 of patch 12, expected less than 12"),
         (f32, "token_ids", 4, &u32::MAX.to_le_bytes(), "token 1 of patch 4294967295, expected less than 12"),
         (f32, "token_ids", 8, &0_u32.to_le_bytes(), "two tokens of patch 0, the second is token 2"),
