@@ -30,7 +30,7 @@ pub use encode::names::{find_scene, frame_positions};
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{Scene, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, load_renderer};
 pub use scene::token_coding::{CodedLoss, TokenCoding};
 pub use scene::token_format::TokenFormat;
 pub use scene::write::check_output_path;

@@ -8,28 +8,39 @@ use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::Camera;
 use clift_model::{
     Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, Tokens,
-    interleaved, open_renderer, phases, render_bytes, renderer_hash,
+    open_renderer, render_bytes, renderer_hash,
 };
 
+use crate::scene::frame_size::{FramePlan, TrainedImage};
 use crate::scene::scene::Scene;
 
-/// Most frames of one call with all tokens, where frames share keys and values.
-const FRAMES_PER_CALL: usize = 8;
-/// Most patches of one call with several frames: eight frames of 512 x 512 pixels.
+/// Most images of one call, which share keys and values, and most frames that are rendered together.
+const IMAGES_PER_CALL: usize = 8;
+/// Most patches of one call with several images: eight images of 512 x 512 pixels.
 const PATCHES_PER_CALL: usize = 1 << 15;
+/// Most pixels of several frames that are rendered together.
+const PIXELS_PER_CALL: usize = 1 << 21;
 
-/// Returns the number of frames of `num_patches` patches that one call renders.
-pub fn frames_per_call(num_patches: usize) -> usize {
-    (PATCHES_PER_CALL / num_patches.max(1)).clamp(1, FRAMES_PER_CALL)
+/// Returns the number of frames of `height` by `width` pixels that are rendered together.
+fn frames_per_call(height: usize, width: usize) -> usize {
+    (PIXELS_PER_CALL / (height * width).max(1)).clamp(1, IMAGES_PER_CALL)
 }
 
-/// Returns the peak bytes of tensors, without weights, while one call renders frames of a scene with the network `model`.
-pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [height, width]: [usize; 2]) -> u64 {
-    let (k, size) = phases(scene.height, model.patch_size, [height, width]);
-    let grids = model.patch_grids.patches(model.patch_size, size.map(|side| side / model.patch_size));
+/// Returns the number of images of `[rows, columns]` patches that one call renders.
+fn images_per_call([rows, columns]: [usize; 2]) -> usize {
+    (PATCHES_PER_CALL / (rows * columns).max(1)).clamp(1, IMAGES_PER_CALL)
+}
+
+/// Returns the peak bytes of tensors and pixels, without weights, while frames of a scene are rendered with the network
+/// `model`.
+pub fn frame_bytes(scene: &Scene, model: &ModelConfig, [height, width]: [usize; 2]) -> u64 {
+    let patches = TrainedImage::of(scene).patches();
+    let num_images = images_per_call(patches);
+    let grids = model.patch_grids.patches(model.patch_size, patches);
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
-    let num_images = k * k * num_frames;
-    render_bytes(model, scene.num_tokens(), num_images, num_images * largest)
+    // Three values of four bytes per pixel of the frames, and of one while it is resampled.
+    let pixels = ((frames_per_call(height, width) + 2) * height * width * 12) as u64;
+    render_bytes(model, scene.num_tokens(), num_images, num_images * largest) + pixels
 }
 
 /// Reads the renderer of a scene from a weight file.
@@ -55,7 +66,7 @@ pub struct RenderedView {
     pub tokens: Option<Vec<u32>>,
     /// Seconds of token selection.
     pub select_s: f64,
-    /// Seconds from the tokens to the pixels on the host; the mean of the frames of one call.
+    /// Seconds from the tokens to the pixels on the host; the mean of the frames that are rendered together.
     pub render_s: f64,
 }
 
@@ -69,8 +80,7 @@ pub struct SceneRenderer {
     selector: Selector,
     /// Whether tokens have rays, by which a view selects them.
     has_patch_tokens: bool,
-    /// Rows of the images that the network was trained on.
-    trained_height: usize,
+    trained: TrainedImage,
     device: Device,
 }
 
@@ -86,8 +96,8 @@ impl SceneRenderer {
         let tokens = Tokens::of_patches(&scene.model, values, &context, &scene.token_ids);
         let selector = Selector::new(rules, &scene.token_rays())?;
         let cache = renderer.project_tokens(tokens);
-        let (has_patch_tokens, trained_height) = (scene.model.has_patch_tokens(), scene.height);
-        Ok(Self { renderer, cache, selector, has_patch_tokens, trained_height, device: device.clone() })
+        let (has_patch_tokens, trained) = (scene.model.has_patch_tokens(), TrainedImage::of(scene));
+        Ok(Self { renderer, cache, selector, has_patch_tokens, trained, device: device.clone() })
     }
 
     /// Returns the number of the scene's tokens.
@@ -95,10 +105,9 @@ impl SceneRenderer {
         self.cache.num_tokens()
     }
 
-    /// Returns the number of frames of `width` by `height` pixels that one call renders.
+    /// Returns the number of frames of `width` by `height` pixels that are rendered together.
     pub fn frames_per_call(&self, height: usize, width: usize) -> usize {
-        let patch_size = self.renderer.patch_size();
-        frames_per_call(height / patch_size * (width / patch_size))
+        frames_per_call(height, width)
     }
 
     /// Resets token selection: the next frame does not depend on earlier frames.
@@ -117,16 +126,14 @@ impl SceneRenderer {
     }
 
     /// Renders the next frames of a path, each from its own selection of `num_render_tokens` tokens, or from all tokens if
-    /// the scene has no more. Frames of all tokens are rendered [`Self::frames_per_call`] at a time. Frames larger than the
-    /// context views are interleaved from several of about their size: smooth, but without more detail.
+    /// the scene has no more. Frames of all tokens are rendered [`Self::frames_per_call`] at a time. A frame of another size
+    /// or field of view than the context views is resampled from images like theirs: it keeps the field of view of its
+    /// camera, and a larger one has no more detail.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, and for
-    /// fewer learned tokens than all,
+    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, for
+    /// fewer learned tokens than all, and for a field of view of more than 64 context views,
     /// [`ModelError::Device`] if an image cannot be read from the device.
-    ///
-    /// # Panics
-    /// If a side is not a multiple of the patch.
     pub fn render(
         &mut self,
         views: &[Camera],
@@ -142,51 +149,61 @@ impl SceneRenderer {
             );
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: num_render_tokens.to_string(), fix });
         }
+        let plan = |view: &Camera| FramePlan::new(self.trained, view, [height, width]);
         if num_render_tokens >= self.num_storage_tokens() {
             for views in views.chunks(self.frames_per_call(height, width)) {
-                rendered.extend(self.render_call(views, height, width, None, 0.0)?);
+                let plans: Vec<FramePlan> = views.iter().map(plan).collect::<Result<_, _>>()?;
+                rendered.extend(self.draw(&plans, None, 0.0)?);
             }
             return Ok(rendered);
         }
-        for view in views {
+        for plan in views.iter().map(plan).collect::<Result<Vec<_>, _>>()? {
             let started = Instant::now();
-            let selected = self.selector.select(view, height, width, num_render_tokens)?;
+            let (view, [height, width]) = plan.whole();
+            let selected = self.selector.select(&view, height, width, num_render_tokens)?;
             let select_s = started.elapsed().as_secs_f64();
-            rendered.extend(self.render_call(&[*view], height, width, Some(selected), select_s)?);
+            rendered.extend(self.draw(&[plan], Some(selected), select_s)?);
         }
         Ok(rendered)
     }
 
-    fn render_call(
+    /// Draws the windows of frames, [`images_per_call`] at a time, and resamples them.
+    fn draw(
         &self,
-        views: &[Camera],
-        height: usize,
-        width: usize,
+        plans: &[FramePlan],
         selected: Option<Vec<u32>>,
         select_s: f64,
     ) -> Result<Vec<RenderedView>, ModelError> {
         let started = Instant::now();
-        let cameras = Cameras::of_views(views, height, width, &self.device)?;
         let some = selected.as_ref().map(|selected| self.cache.select(selected));
         let cache = some.as_ref().unwrap_or(&self.cache);
-        let draw = |cameras: &Cameras| self.renderer.render_cached(cache, cameras);
-        let images = interleaved(self.trained_height, self.renderer.patch_size(), &cameras, draw);
-        let images = images.into_data().convert::<f32>();
-        let pixels = images.try_to_vec::<f32>().map_err(ModelError::device)?;
-        let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
+        let windows: Vec<Camera> = plans.iter().flat_map(FramePlan::windows).collect();
+        let [height, width] = self.trained.size;
+        let mut pixels = Vec::with_capacity(windows.len() * height * width * 3);
+        for windows in windows.chunks(images_per_call(self.trained.patches())) {
+            let cameras = Cameras::of_views(windows, height, width, &self.device)?;
+            let images = self.renderer.render_cached(cache, &cameras).into_data().convert::<f32>();
+            pixels.extend(images.try_to_vec::<f32>().map_err(ModelError::device)?);
+        }
         if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
             return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });
         }
-        let frames = pixels.chunks_exact(height * width * 3);
-        Ok(frames
-            .map(|pixels| RenderedView { pixels: pixels.to_vec(), tokens: selected.clone(), select_s, render_s })
-            .collect())
+        let mut rest = &pixels[..];
+        let frame = |plan: &FramePlan| {
+            let (windows, others) = rest.split_at(plan.windows().len() * height * width * 3);
+            rest = others;
+            plan.assemble(windows)
+        };
+        let frames: Vec<Vec<f32>> = plans.iter().map(frame).collect();
+        let render_s = started.elapsed().as_secs_f64() / plans.len() as f64;
+        let view = |pixels| RenderedView { pixels, tokens: selected.clone(), select_s, render_s };
+        Ok(frames.into_iter().map(view).collect())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use clift_model::{CameraEncoding, Clift, SelectionPreset, save_weights};
+    use clift_model::{CameraEncoding, Clift, SelectionPreset, psnr, save_weights};
 
     use super::*;
     use crate::scene::scene::tests::{camera, scene};
@@ -262,36 +279,102 @@ mod tests {
         }
     }
 
+    /// Resamples an image with Pillow's BICUBIC filter: an independent reference, by definition in f64.
+    fn resampled(image: &[f32], [rows, columns]: [usize; 2], [height, width]: [usize; 2]) -> Vec<f32> {
+        let cubic = |x: f64| match x.abs() {
+            x if x < 1.0 => (1.5 * x - 2.5) * x * x + 1.0,
+            x if x < 2.0 => ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0,
+            _ => 0.0,
+        };
+        let taps = |from: usize, to: usize, pixel: usize| {
+            let scale = from as f64 / to as f64;
+            let centre = (pixel as f64 + 0.5) * scale - 0.5;
+            let weights: Vec<f64> = (0..from).map(|i| cubic((i as f64 - centre) / scale.max(1.0))).collect();
+            let sum: f64 = weights.iter().sum();
+            weights.into_iter().map(move |weight| weight / sum).collect::<Vec<f64>>()
+        };
+        let across: Vec<Vec<f64>> = (0..width).map(|pixel| taps(columns, width, pixel)).collect();
+        let down: Vec<Vec<f64>> = (0..height).map(|pixel| taps(rows, height, pixel)).collect();
+        let mut frame = Vec::new();
+        for (row, column, channel) in (0..height * width * 3).map(|i| (i / 3 / width, i / 3 % width, i % 3)) {
+            let value = |y: usize, x: usize| f64::from(image[(y * columns + x) * 3 + channel]);
+            let line =
+                |y: usize| across[column].iter().enumerate().map(|(x, weight)| weight * value(y, x)).sum::<f64>();
+            frame.push(down[row].iter().enumerate().map(|(y, weight)| weight * line(y)).sum::<f64>() as f32);
+        }
+        frame
+    }
+
+    /// Returns the middle of a frame.
+    fn middle(frame: &[f32], [height, width]: [usize; 2], [rows, columns]: [usize; 2]) -> Vec<f32> {
+        let [top, left] = [(height - rows) / 2, (width - columns) / 2];
+        (0..rows).flat_map(|row| &frame[((top + row) * width + left) * 3..][..columns * 3]).copied().collect()
+    }
+
     #[test]
-    fn every_second_pixel_of_a_frame_of_twice_the_size_is_a_frame_of_the_trained_size() {
+    fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
         let device = Device::flex();
-        let config = ModelConfig { patch_grids: PatchGrids::Four, ..encoded(CameraEncoding::Gta) };
-        let renderer = Clift::new(&config, 3, &device).renderer;
-        let scene = whole_scene(&renderer, &config);
-        let mut scene_renderer =
-            SceneRenderer::new(&scene, renderer, SelectionPreset::default().rules(), &device).unwrap();
-        let [large, small] = [camera(0.1, 0.2).resized([16, 24], [32, 48]), camera(0.1, 0.2)];
-        let large = scene_renderer.render(&[large], 32, 48, 12).unwrap().remove(0).pixels;
-        for (row, column) in [(0, 0), (1, 0), (1, 1)] {
-            // Pixel (0, 0) of the large frame is a quarter of a small pixel above and left of the small one's center.
-            let shift = |phase: usize| 0.25 - 0.5 * phase as f64;
-            let mut view = small;
-            view.intrinsics.cx += shift(column);
-            view.intrinsics.cy += shift(row);
-            let alone = scene_renderer.render(&[view], 16, 24, 12).unwrap().remove(0).pixels;
-            for (i, expected) in alone.as_chunks::<3>().0.iter().enumerate() {
-                let at = 3 * ((2 * (i / 24) + row) * 48 + 2 * (i % 24) + column);
-                let error = large[at..at + 3].iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-                assert!(error < 1e-5, "{error} at pixel {i} of phase {row}, {column}");
+        // The trained image has 24 x 16 pixels; sizes are height and width.
+        let sizes = [
+            [8, 12],
+            [12, 18],
+            [14, 21],
+            [16, 24],
+            [17, 25],
+            [20, 30],
+            [24, 36],
+            [31, 47],
+            [32, 48],
+            [40, 60],
+            [48, 72],
+            [64, 96],
+            [128, 192],
+            [16, 12],
+            [40, 40],
+            [64, 24],
+            [16, 36],
+            [24, 60],
+            [32, 128],
+            [48, 192],
+        ];
+        for (encoding, grids) in [
+            (CameraEncoding::Plucker, PatchGrids::One),
+            (CameraEncoding::Gta, PatchGrids::Two),
+            (CameraEncoding::Prope, PatchGrids::Four),
+        ] {
+            let config = ModelConfig { patch_grids: grids, ..encoded(encoding) };
+            let renderer = Clift::new(&config, 3, &device).renderer;
+            let scene = whole_scene(&renderer, &config);
+            let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
+            let mut frame = |size: [usize; 2], count| {
+                renderer.reset();
+                let view = camera(0.1, 0.2).resized([16, 24], size);
+                renderer.render(&[view], size[0], size[1], count).unwrap().remove(0).pixels
+            };
+            for (size, count) in sizes.into_iter().flat_map(|size| [(size, 12), (size, 5)]) {
+                let [height, width] = size;
+                let trained = frame([16, 24], count);
+                // Columns of the trained field of view at the height of the frame.
+                let full = (height as f64 * 1.5).round() as usize;
+                // Of a wide frame other tokens may be selected.
+                if width > full + full / 50 && count < 12 {
+                    continue;
+                }
+                let expected = resampled(&trained, [16, 24], [height, full]);
+                let shown = [height, full.min(width)];
+                let (got, expected) =
+                    (middle(&frame(size, count), size, shown), middle(&expected, [height, full], shown));
+                let db = psnr(&got, &expected).unwrap();
+                assert!(db >= 45.0, "{encoding:?}, {size:?}, {count} tokens: {db} dB");
             }
         }
     }
 
     #[test]
-    fn larger_frames_are_fewer_per_call() {
-        let patches = |height: usize, width: usize| height / 8 * (width / 8);
-        let sizes = [(512, 512), (1024, 1024), (2048, 1024), (1 << 14, 1 << 14), (0, 8)];
-        assert_eq!(sizes.map(|(height, width)| frames_per_call(patches(height, width))), [8, 2, 1, 1, 8]);
+    fn frames_of_any_size_are_bounded_in_memory() {
+        let sizes = [(16, 24), (512, 512), (1024, 1024), (2048, 2048), (1 << 14, 1 << 14), (0, 8)];
+        assert_eq!(sizes.map(|(height, width)| frames_per_call(height, width)), [8, 8, 2, 1, 1, 8]);
+        assert_eq!([[8, 8], [64, 64], [128, 128], [512, 512]].map(images_per_call), [8, 8, 2, 1]);
     }
 
     #[test]

@@ -306,7 +306,7 @@ function fillPanel(header, share) {
     ? `Fixed in the scene file: ${header.tokens}.`
     : `Of ${header.num_patches} patches of the context views; another number encodes the scene again.`;
   const sizes = header.sizes.map((size, i) => new Option(size.join(" × "), i));
-  const former = $("size").options.length === sizes.length ? Number($("size").value) : header.default_size;
+  const former = $("size").options.length === sizes.length ? Number($("size").value) : 0;
   $("size").replaceChildren(...sizes);
   $("size").value = former;
   $("compare-section").hidden = header.frames.length === 0;
