@@ -28,6 +28,7 @@ pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
 pub use encode::names::{find_scene, frame_positions};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
+pub use scene::frame_size::check_frames;
 pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{Scene, scene_file_bytes};
 pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, load_renderer};

@@ -44,6 +44,16 @@ impl TrainedImage {
     }
 }
 
+/// Checks that a scene can be rendered at `[height, width]` pixels from all views.
+///
+/// # Errors
+/// [`ModelError::NotFinite`] for intrinsics that are not finite, [`ModelError::BadConfig`] for focal lengths that are not
+/// positive and for a field of view of more than 64 context views.
+pub fn check_frames(scene: &Scene, views: &[Camera], size: [usize; 2]) -> Result<(), ModelError> {
+    let trained = TrainedImage::of(scene);
+    views.iter().try_for_each(|view| FramePlan::new(trained, view, size).map(|_| ()))
+}
+
 /// The windows that a frame is drawn from, and their place under it.
 #[derive(Debug)]
 pub(crate) struct FramePlan {
@@ -57,8 +67,7 @@ impl FramePlan {
     /// Plans a frame of `[height, width]` pixels.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`] for intrinsics that are not finite, [`ModelError::BadConfig`] for focal lengths that are not
-    /// positive and for a field of view of more than 64 windows.
+    /// As [`check_frames`].
     pub fn new(trained: TrainedImage, view: &Camera, [height, width]: [usize; 2]) -> Result<Self, ModelError> {
         let intrinsics = view.intrinsics.to_array();
         if let Some(position) = intrinsics.iter().position(|value| !value.is_finite()) {

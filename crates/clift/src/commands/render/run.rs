@@ -7,7 +7,7 @@ use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_pat
 use clift_data::read_poses;
 use clift_eval::available_bytes;
 use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision};
-use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, frame_bytes, load_renderer};
+use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, check_frames, frame_bytes, load_renderer};
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};
@@ -64,6 +64,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         OutputFile::new(video, args.force, &[&args.scene])?;
     }
     let views = path_cameras(&scene, args, height, width)?;
+    check_frames(&scene, &views, [height, width])?;
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let stop = interrupt::flag()?;
     let opened = device.open()?;
