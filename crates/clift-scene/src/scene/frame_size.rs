@@ -13,12 +13,17 @@ use fast_image_resize::{FilterType, ResizeAlg, ResizeOptions, Resizer};
 
 use crate::scene::scene::Scene;
 
-/// Relative difference of a frame's field of view from that of the trained image, up to which the frame shows the whole
-/// trained image: cameras of one lens differ by as much, and windows around the middle one would show their edges alone.
-const EQUAL: f64 = 0.02;
+/// Relative difference of a focal length from the mean of the context views up to which the network draws with it: the
+/// cameras of one lens differ by as much.
+const SAME_LENS: f64 = 0.02;
+/// Relative difference of the scales along rows and columns up to which they are one scale.
+const SAME_SCALE: f64 = 1e-3;
+/// Share of the trained image that a frame may reach beyond it on either side without further windows: the pixels at the
+/// edge are repeated.
+const REPEATED: f64 = 0.01;
 /// Most windows of a frame.
 const MAX_WINDOWS: usize = 64;
-/// Pixels that a rounding error may add to the field of view.
+/// Pixels or patches that a rounding error may add to the field of view.
 const ROUNDING: f64 = 1e-6;
 
 /// The images that a network was trained on.
@@ -79,11 +84,16 @@ impl FramePlan {
         if fx.min(fy) <= 0.0 {
             return Err(bad(format!("focal lengths are {fx} and {fy} pixels: write positive numbers")));
         }
-        let axis = |axis: usize, side: usize, focal: f64| {
-            let length = side as f64 * trained.focal[axis] / focal;
-            Axis::new(side, length, trained.size[axis], trained.patch_size)
-        };
-        let axes = axis(0, height, fy).zip(axis(1, width, fx));
+        let sides = [height, width];
+        // Field of view of the frame over that of the trained image.
+        let mut ratios = [(0, fy), (1, fx)]
+            .map(|(axis, focal)| sides[axis] as f64 * trained.focal[axis] / focal / trained.size[axis] as f64);
+        let is_equal = |a: f64, b: f64, tolerance: f64| (a / b - 1.0).abs() <= tolerance;
+        if is_equal(ratios[0], 1.0, SAME_LENS) && is_equal(ratios[1], ratios[0], SAME_SCALE) {
+            ratios = [1.0; 2];
+        }
+        let axis = |axis: usize| Axis::new(sides[axis], ratios[axis], trained.size[axis], trained.patch_size);
+        let axes = axis(0).zip(axis(1));
         match axes.filter(|(rows, columns)| rows.windows.len() * columns.windows.len() <= MAX_WINDOWS) {
             Some((rows, columns)) => Ok(Self { trained, view: *view, rows, columns }),
             None => Err(bad(format!(
@@ -126,7 +136,16 @@ impl FramePlan {
     /// - returns `[frame height, frame width, 3]`
     pub fn assemble(&self, windows: &[f32]) -> Vec<f32> {
         let [height, width] = self.size();
-        let pixels: Vec<F32x3> = self.mosaic(windows).as_chunks::<3>().0.iter().map(|&rgb| F32x3::new(rgb)).collect();
+        let mosaic = self.mosaic(windows);
+        let pixels = mosaic.as_chunks::<3>().0;
+        // With the edges repeated.
+        let [down, across] = [self.rows.repeated(), self.columns.repeated()];
+        let inside = |place: usize, repeated: usize, side: usize| place.saturating_sub(repeated).min(side - 1);
+        let row = |y: usize| &pixels[inside(y, down, height) * width..][..width];
+        let pixels: Vec<F32x3> = (0..height + 2 * down)
+            .flat_map(|y| (0..width + 2 * across).map(move |x| F32x3::new(row(y)[inside(x, across, width)])))
+            .collect();
+        let [height, width] = [height + 2 * down, width + 2 * across];
         let image = TypedImageRef::new(width as u32, height as u32, &pixels).expect("a pixel per place");
         let mut frame = TypedImage::<F32x3>::new(self.columns.side as u32, self.rows.side as u32);
         let ([left, wide], [top, high]) = (self.columns.cut(width), self.rows.cut(height));
@@ -140,9 +159,6 @@ impl FramePlan {
     fn mosaic(&self, windows: &[f32]) -> Vec<f32> {
         let [trained_height, trained_width] = self.trained.size;
         let [height, width] = self.size();
-        if windows.len() == height * width * 3 {
-            return windows.to_vec();
-        }
         let images: Vec<&[f32]> = windows.chunks_exact(trained_height * trained_width * 3).collect();
         let mut mosaic = Vec::with_capacity(height * width * 3);
         for row in 0..height {
@@ -176,12 +192,12 @@ struct Axis {
 }
 
 impl Axis {
-    /// Covers `length` pixels of the network around the middle of the trained image; `None` for too many windows.
-    fn new(side: usize, length: f64, trained: usize, patch_size: usize) -> Option<Self> {
+    /// Covers `ratio` times the trained image, around its middle; `None` for too many windows.
+    fn new(side: usize, ratio: f64, trained: usize, patch_size: usize) -> Option<Self> {
         let whole = trained as f64;
-        let length = if (length / whole - 1.0).abs() <= EQUAL { whole } else { length };
+        let length = ratio * whole;
         let start = (whole - length) / 2.0;
-        let patches = ((-start - ROUNDING) / patch_size as f64).ceil().max(0.0);
+        let patches = if -start <= REPEATED * whole { 0.0 } else { (-start / patch_size as f64 - ROUNDING).ceil() };
         let beyond = patches * patch_size as f64;
         if beyond > whole * MAX_WINDOWS as f64 {
             return None;
@@ -197,9 +213,14 @@ impl Axis {
         self.windows[0].unsigned_abs() as usize
     }
 
-    /// Returns the beginning and the length of the frame in an image of all windows, of `size` pixels.
+    /// Returns the number of pixels to repeat at either edge of an image of all windows.
+    fn repeated(&self) -> usize {
+        (-self.start - self.beyond() as f64 - ROUNDING).ceil().max(0.0) as usize
+    }
+
+    /// Returns the beginning and the length of the frame in an image of all windows and repeated edges, of `size` pixels.
     fn cut(&self, size: usize) -> [f64; 2] {
-        let first = (self.start + self.beyond() as f64).max(0.0);
+        let first = (self.start + (self.beyond() + self.repeated()) as f64).max(0.0);
         [first, self.length.min(size as f64 - first)]
     }
 
@@ -248,9 +269,9 @@ mod tests {
         for (size, rows, columns) in [
             ([16, 24], vec![0], vec![0]),
             ([8, 12], vec![0], vec![0]),
-            ([37, 55], vec![0], vec![0]),          // within 2 % of the proportions
-            ([16, 10], vec![0], vec![0]),          // narrower: cut from the trained image
-            ([16, 26], vec![0], vec![-8, 0, 8]),   // one pixel on either side: a patch
+            ([37, 56], vec![0], vec![0]), // a tenth of a pixel beyond on either side: repeated
+            ([16, 10], vec![0], vec![0]), // narrower: cut from the trained image
+            ([16, 26], vec![0], vec![-8, 0, 8]), // one pixel on either side: a patch
             ([32, 96], vec![0], vec![-16, 0, 16]), // 48 pixels: 12 on either side
             ([16, 120], vec![0], vec![-48, -24, 0, 24, 48]),
         ] {
@@ -276,7 +297,8 @@ mod tests {
     #[test]
     fn every_pixel_of_a_frame_of_any_size_shows_its_own_direction() {
         let off_centre = Intrinsics { fx: 31.0, fy: 14.0, cx: 40.0, cy: 3.0 };
-        let sizes = [[16, 24], [32, 48], [24, 36], [37, 50], [12, 18], [16, 10], [16, 40], [61, 24], [64, 250]];
+        let sizes =
+            [[16, 24], [32, 48], [24, 36], [37, 50], [12, 18], [16, 10], [16, 40], [61, 24], [64, 250], [32, 144]];
         let plans = sizes.map(|size| plan(size).unwrap()).into_iter();
         let other = FramePlan::new(TRAINED, &Camera { intrinsics: off_centre, ..view() }, [40, 56]).unwrap();
         for plan in plans.chain([other]) {
