@@ -70,7 +70,6 @@ pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tenso
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras
-pub use views::interleave::{interleaved, phases};
 pub use views::patch::{patchify, unpatchify};
 pub use views::patch_grids::PatchGrids;
 pub use views::rays::plucker;

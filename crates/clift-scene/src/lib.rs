@@ -28,9 +28,10 @@ pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
 pub use encode::names::{find_scene, frame_positions};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
+pub use scene::frame_size::check_frames;
 pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{ContextGroup, Scene, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, load_renderer};
 pub use scene::token_coding::{CodedLoss, TokenCoding};
 pub use scene::token_format::TokenFormat;
 pub use scene::write::check_output_path;

@@ -169,6 +169,7 @@ fn paths_render_to_frames_and_animation_by_count() {
         ("some", (16, 16), "--path interpolate --render 3 --precision f32", 3),
         ("global", (16, 16), "--path orbit --render 1/2 --selection global --patch-grids 4", 4),
         ("large", (48, 32), "--path orbit --size 48x32", 8),
+        ("small", (7, 15), "--path orbit --size 7x15 --render 3", 3),
         ("in-time", (16, 16), "--path orbit --budget-ms 60000", 8),
     ] {
         let ran = place.clift(&format!("render DIR/room.clift --out DIR/{out} {flags} --frames 10 --fps 12")).ok();
@@ -227,7 +228,7 @@ fn what_cannot_be_drawn_says_what_to_do() {
     render("--path interpolated").fails_with(2, &[no_path]);
     for (flags, expected) in [
         ("--budget-ms 0.0001", "the fastest frame takes "),
-        ("--size 20x16", "an image of 20 x 16 does not divide into patches of 8 x 8"),
+        ("--size 4000x8", "the field of view takes more than 64 images of the trained size"),
         ("--size 1000000x8", "--size 1000000x8: write at most 16384 pixels per side"),
         ("--size 17179869184x17179869184", "--size 17179869184x17179869184: write at most 16384 pixels per side"),
         ("--render 9", "a scene has 2 tokens"),
@@ -367,6 +368,16 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     encode(&format!("{mini}/test")).ok().prints("scene 00000000000000b1");
     let second = encode(&format!("{mini} --split train --scene 00000000000000a2")).ok();
     second.prints("scene 00000000000000a2");
+    // Images of 64 x 36: another crop keeps the pixels per angle, another number of rows does not.
+    let sized =
+        |width: usize, height: usize| encode(&format!("{mini} --set data.width={width} --set data.height={height}"));
+    let warning = "warning: the network was trained on images of 16 x 16; images of 24 x 16 may lose quality";
+    sized(24, 16).ok().prints("2 views of 24 x 16").notes(warning);
+    for (size, times) in [(32, "2.00"), (8, "0.50")] {
+        let images =
+            format!("at {size} x {size} pixels, images of 64 x 36 have {times} times as many pixels per angle");
+        sized(size, size).fails_with(2, &[&images, "write at most 24 x 16, and choose the size of frames with"]);
+    }
     encode("DIR/run").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
 
     let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift --force"));

@@ -125,7 +125,7 @@ impl Tab {
         c2w[3] += 0.001 * (self.seq % 100) as f64;
         let view = json!({
             "type": "view", "seq": self.seq, "c2w": c2w, "intrinsics": context["intrinsics"], "tokens": tokens,
-            "selection": "scaled", "precision": "f32", "size": self.scene["default_size"], "budget_ms": null,
+            "selection": "scaled", "precision": "f32", "size": 0, "budget_ms": null,
             "rest": false, "list_tokens": false,
         });
         self.send(&view);

@@ -3,10 +3,8 @@
 //! - `upload`: copies images and cameras to a device
 //! - `rays`: Plücker coordinates of every pixel
 //! - `patch`: images to patch vectors and back
-//! - `interleave`: large images from several of the trained size
 //! - `patch_grids`: images averaged over shifted grids of patches
 
-pub(crate) mod interleave;
 pub(crate) mod patch;
 pub(crate) mod patch_grids;
 pub(crate) mod rays;

@@ -3,12 +3,14 @@
 //! `scene` holds a stored scene and documents the bytes of its file; `check` the rules of a valid scene; `read` and
 //! `write` the file itself, with its `header` and the tokens in a `token_format`; `coded_file` the file with coded tokens,
 //! and `coded_views` its cameras; `token_coding` the names of both ways; `model_place` the path of its model.
-//! `scene_renderer` renders frames of a scene on a device, and `render_budget` measures how many tokens a time per frame
-//! allows.
+//! `scene_renderer` renders frames of a scene on a device, `group_shares` from which groups, `frame_size` makes frames of any size from images of the trained
+//! size, and `render_budget` measures how many tokens a time per frame allows.
 
 pub(crate) mod check;
 pub(crate) mod coded_file;
 pub(crate) mod coded_views;
+pub(crate) mod frame_size;
+pub(crate) mod group_shares;
 pub(crate) mod header;
 pub(crate) mod model_place;
 pub(crate) mod read;

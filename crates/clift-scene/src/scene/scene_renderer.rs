@@ -8,28 +8,40 @@ use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::{Camera, Pose, ViewDistance};
 use clift_model::{
     Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, TokenRay, Tokens,
-    interleaved, open_renderer, phases, render_bytes, renderer_hash,
+    open_renderer, render_bytes, renderer_hash,
 };
 
+use crate::scene::frame_size::{FramePlan, TrainedImage};
+use crate::scene::group_shares::group_shares;
 use crate::scene::scene::{ContextGroup, Scene};
 
-/// Most frames of one call with all tokens, where frames share keys and values.
-const FRAMES_PER_CALL: usize = 8;
-/// Most patches of one call with several frames: eight frames of 512 x 512 pixels.
+/// Most images of one call, which share keys and values, and most frames that are rendered together.
+const IMAGES_PER_CALL: usize = 8;
+/// Most patches of one call with several images: eight images of 512 x 512 pixels.
 const PATCHES_PER_CALL: usize = 1 << 15;
+/// Most pixels of several frames that are rendered together.
+const PIXELS_PER_CALL: usize = 1 << 21;
 
-/// Returns the number of frames of `num_patches` patches that one call renders.
-pub fn frames_per_call(num_patches: usize) -> usize {
-    (PATCHES_PER_CALL / num_patches.max(1)).clamp(1, FRAMES_PER_CALL)
+/// Returns the number of frames of `height` by `width` pixels that are rendered together.
+fn frames_per_call(height: usize, width: usize) -> usize {
+    (PIXELS_PER_CALL / (height * width).max(1)).clamp(1, IMAGES_PER_CALL)
 }
 
-/// Returns the peak bytes of tensors, without weights, while one call renders frames of a scene with the network `model`.
-pub fn frame_bytes(scene: &Scene, model: &ModelConfig, num_frames: usize, [height, width]: [usize; 2]) -> u64 {
-    let (k, size) = phases(scene.height, model.patch_size, [height, width]);
-    let grids = model.patch_grids.patches(model.patch_size, size.map(|side| side / model.patch_size));
+/// Returns the number of images of `[rows, columns]` patches that one call renders.
+fn images_per_call([rows, columns]: [usize; 2]) -> usize {
+    (PATCHES_PER_CALL / (rows * columns).max(1)).clamp(1, IMAGES_PER_CALL)
+}
+
+/// Returns the peak bytes of tensors and pixels, without weights, while frames of a scene are rendered with the network
+/// `model`.
+pub fn frame_bytes(scene: &Scene, model: &ModelConfig, [height, width]: [usize; 2]) -> u64 {
+    let patches = TrainedImage::new(scene, &scene.context).patches();
+    let num_images = images_per_call(patches);
+    let grids = model.patch_grids.patches(model.patch_size, patches);
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
-    let num_images = k * k * num_frames;
-    render_bytes(model, scene.max_group_tokens(), num_images, num_images * largest)
+    // Three values of four bytes per pixel of the frames, and of one while it is resampled.
+    let pixels = ((frames_per_call(height, width) + 2) * height * width * 12) as u64;
+    render_bytes(model, scene.max_group_tokens(), num_images, num_images * largest) + pixels
 }
 
 /// Reads the renderer of a scene from a weight file.
@@ -55,7 +67,7 @@ pub struct RenderedView {
     pub tokens: Option<Vec<u32>>,
     /// Seconds of token selection.
     pub select_s: f64,
-    /// Seconds from the tokens to the pixels on the host; the mean of the frames of one call.
+    /// Seconds from the tokens to the pixels on the host; the mean of the frames that are rendered together.
     pub render_s: f64,
 }
 
@@ -68,8 +80,6 @@ pub struct SceneRenderer {
     distance: ViewDistance,
     /// Whether tokens have rays, by which a view selects them.
     has_patch_tokens: bool,
-    /// Rows of the images that the network was trained on.
-    trained_height: usize,
     device: Device,
 }
 
@@ -77,6 +87,7 @@ pub struct SceneRenderer {
 #[derive(Clone, Debug)]
 struct TokenGroup {
     context: ContextGroup,
+    trained: TrainedImage,
     /// Poses of the context views in the scene.
     views: Vec<Pose>,
     /// Positions of the tokens in the scene.
@@ -99,13 +110,15 @@ impl SceneRenderer {
         for (group, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
             let rows = tokens.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
             let values = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, tokens.len(), dim]);
-            let cameras = Cameras::of_views(&scene.group_cameras(group), scene.height, scene.width, device)?;
+            let context = scene.group_cameras(group);
+            let cameras = Cameras::of_views(&context, scene.height, scene.width, device)?;
             let patches: Vec<u32> = tokens.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
             let values = Tensor::from_data(values, device);
             let rays: Vec<TokenRay> = tokens.iter().filter_map(|&token| rays.get(token as usize)).copied().collect();
             groups.push(TokenGroup {
                 views: group.views.iter().map(|&view| scene.context[view as usize].c2w).collect(),
                 context: group.clone(),
+                trained: TrainedImage::new(scene, &context),
                 cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
                 selector: Selector::new(rules, &rays)?,
                 tokens,
@@ -118,7 +131,6 @@ impl SceneRenderer {
             groups,
             distance: ViewDistance::new(&context),
             has_patch_tokens: scene.model.has_patch_tokens(),
-            trained_height: scene.height,
             device: device.clone(),
         })
     }
@@ -128,10 +140,9 @@ impl SceneRenderer {
         self.groups.iter().map(|group| group.tokens.len()).max().unwrap_or_default()
     }
 
-    /// Returns the number of frames of `width` by `height` pixels that one call renders.
+    /// Returns the number of frames of `width` by `height` pixels that are rendered together.
     pub fn frames_per_call(&self, height: usize, width: usize) -> usize {
-        let patch_size = self.renderer.patch_size();
-        frames_per_call(height / patch_size * (width / patch_size))
+        frames_per_call(height, width)
     }
 
     /// Resets token selection: the next frame does not depend on earlier frames.
@@ -151,17 +162,15 @@ impl SceneRenderer {
 
     /// Renders the next frames of a path from the groups of tokens nearest to each: of every group from the
     /// `num_render_tokens` tokens nearest to the view, or all its tokens if it has no more. A frame between groups is a mean
-    /// of their images with weights that change continuously along a path (`GroupBlend`); of `num_render_tokens`, each
-    /// group has its share. Frames of all tokens are rendered [`Self::frames_per_call`] at a time. Frames larger than the
-    /// context views are interleaved from several of about their size: smooth, but without more detail.
+    /// of their images with weights that change continuously along a path; of `num_render_tokens`, each group has its share.
+    /// Frames of all tokens are rendered [`Self::frames_per_call`] at a time. A frame of another size or field of view than
+    /// the context views is resampled from images like theirs: it keeps the field of view of its camera, and a larger one has
+    /// no more detail.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, and for
-    /// fewer learned tokens than all,
+    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, for
+    /// fewer learned tokens than all, and for a field of view of more than 64 context views,
     /// [`ModelError::Device`] if an image cannot be read from the device.
-    ///
-    /// # Panics
-    /// If a side is not a multiple of the patch.
     pub fn render(
         &mut self,
         views: &[Camera],
@@ -182,7 +191,7 @@ impl SceneRenderer {
         for group in 0..self.groups.len() {
             let share = |frame: usize| shares[frame].iter().find(|(other, _)| *other == group).map(|(_, share)| *share);
             let frames: Vec<(usize, f64)> = (0..views.len()).filter_map(|frame| Some((frame, share(frame)?))).collect();
-            let per_call = if selects { 1 } else { self.frames_per_call(height, width) };
+            let per_call = if selects { 1 } else { frames_per_call(height, width) };
             for frames in frames.chunks(per_call) {
                 let cameras: Vec<Camera> = frames.iter().map(|&(frame, _)| views[frame]).collect();
                 let count = (num_render_tokens as f64 * frames[0].1).ceil() as usize;
@@ -210,9 +219,15 @@ impl SceneRenderer {
         let started = Instant::now();
         let num_groups = self.groups.len();
         let tokens = &mut self.groups[group];
-        let views = &tokens.context.cameras(views.iter().copied())[..];
+        let trained = tokens.trained;
+        let plan = |view: &Camera| FramePlan::new(trained, view, size);
+        let plans: Vec<FramePlan> =
+            tokens.context.cameras(views.iter().copied()).iter().map(plan).collect::<Result<_, _>>()?;
         let selected = match num_render_tokens {
-            Some(count) => Some(tokens.selector.select(&views[0], size[0], size[1], count)?),
+            Some(count) => {
+                let (view, [height, width]) = plans[0].whole();
+                Some(tokens.selector.select(&view, height, width, count)?)
+            }
             None => None,
         };
         let select_s = if selected.is_some() { started.elapsed().as_secs_f64() } else { 0.0 };
@@ -224,59 +239,44 @@ impl SceneRenderer {
             None if num_groups == 1 => None,
             None => Some(tokens.tokens.clone()),
         };
-        let images = self.draw(cache.as_ref().unwrap_or(&self.groups[group].cache), views, size)?;
-        let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
-        let view =
-            |pixels: &[f32]| RenderedView { pixels: pixels.to_vec(), tokens: in_scene.clone(), select_s, render_s };
-        Ok(images.chunks_exact(size[0] * size[1] * 3).map(view).collect())
+        let frames = self.draw(cache.as_ref().unwrap_or(&self.groups[group].cache), trained, &plans)?;
+        let render_s = started.elapsed().as_secs_f64() / plans.len() as f64;
+        let view = |pixels| RenderedView { pixels, tokens: in_scene.clone(), select_s, render_s };
+        Ok(frames.into_iter().map(view).collect())
     }
 
-    /// Draws frames from keys and values of tokens, `[views, height, width, 3]`.
+    /// Draws the windows of frames from keys and values of tokens, [`images_per_call`] at a time, and resamples them.
     fn draw(
         &self,
         cache: &KeyValueCache,
-        views: &[Camera],
-        [height, width]: [usize; 2],
-    ) -> Result<Vec<f32>, ModelError> {
-        let cameras = Cameras::of_views(views, height, width, &self.device)?;
-        let draw = |cameras: &Cameras| self.renderer.render_cached(cache, cameras);
-        let images = interleaved(self.trained_height, self.renderer.patch_size(), &cameras, draw);
-        let pixels = images.into_data().convert::<f32>().try_to_vec::<f32>().map_err(ModelError::device)?;
-        match pixels.iter().position(|value| !value.is_finite()) {
-            Some(position) => Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position }),
-            None => Ok(pixels),
+        trained: TrainedImage,
+        plans: &[FramePlan],
+    ) -> Result<Vec<Vec<f32>>, ModelError> {
+        let windows: Vec<Camera> = plans.iter().flat_map(FramePlan::windows).collect();
+        let [height, width] = trained.size;
+        let mut pixels = Vec::with_capacity(windows.len() * height * width * 3);
+        for windows in windows.chunks(images_per_call(trained.patches())) {
+            let cameras = Cameras::of_views(windows, height, width, &self.device)?;
+            let images = self.renderer.render_cached(cache, &cameras).into_data().convert::<f32>();
+            pixels.extend(images.try_to_vec::<f32>().map_err(ModelError::device)?);
         }
+        if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
+            return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });
+        }
+        let mut rest = &pixels[..];
+        let frame = |plan: &FramePlan| {
+            let (windows, others) = rest.split_at(plan.windows().len() * height * width * 3);
+            rest = others;
+            plan.assemble(windows)
+        };
+        Ok(plans.iter().map(frame).collect())
     }
 
     /// Returns the groups that a view is rendered from, with their shares, which add up to 1.
     fn shares(&self, view: &Pose) -> Vec<(usize, f64)> {
         let distances: Vec<f64> = self.groups.iter().map(|group| self.distance.to_group(view, &group.views)).collect();
-        blend_shares(&distances)
+        group_shares(&distances)
     }
-}
-
-/// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
-const BLEND: f64 = 0.15;
-/// Most groups that a frame is rendered from.
-const MAX_BLENDED: usize = 3;
-
-/// Returns the nearest groups and their shares of a frame, which add up to 1 and change continuously with the distances: a
-/// share falls linearly to 0 where a group is [`BLEND`] farther than the nearest, or as far as the next after
-/// [`MAX_BLENDED`].
-fn blend_shares(distances: &[f64]) -> Vec<(usize, f64)> {
-    let mut order: Vec<usize> = (0..distances.len()).collect();
-    order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]));
-    let Some(&nearest) = order.first() else { return Vec::new() };
-    let limit = distances[nearest] + BLEND;
-    let limit = order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]));
-    let rooms = order.into_iter().take(MAX_BLENDED).map(|group| (group, limit - distances[group]));
-    let mut near: Vec<(usize, f64)> = rooms.filter(|(_, room)| *room > 0.0).collect();
-    if near.is_empty() {
-        return vec![(nearest, 1.0)];
-    }
-    let sum: f64 = near.iter().map(|(_, room)| room).sum();
-    near.iter_mut().for_each(|(_, room)| *room /= sum);
-    near
 }
 
 impl RenderedView {
@@ -299,7 +299,7 @@ impl RenderedView {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::{CameraEncoding, Clift, SelectionPreset, save_weights};
+    use clift_model::{CameraEncoding, Clift, SelectionPreset, psnr, save_weights};
 
     use super::*;
     use crate::scene::scene::tests::{camera, scene, scene_of_groups};
@@ -415,57 +415,102 @@ mod tests {
         }
     }
 
-    #[test]
-    fn shares_of_groups_add_up_and_change_continuously() {
-        assert_eq!(blend_shares(&[0.7]), [(0, 1.0)]);
-        assert_eq!(blend_shares(&[0.9, 0.2]), [(1, 1.0)], "far beyond the nearest");
-        assert_eq!(blend_shares(&[0.5, 0.5]), [(0, 0.5), (1, 0.5)]);
-        assert_eq!(blend_shares(&[0.5; 4]), [(0, 1.0)], "no room before the next after the most groups");
-        let share = |distances: &[f64], group: usize| {
-            blend_shares(distances).iter().find(|(other, _)| *other == group).map_or(0.0, |(_, share)| *share)
+    /// Returns the middle of a frame by bicubic convolution of an image, `scale` pixels of the image per pixel: an independent
+    /// reference in f64, with the filter of Pillow's BICUBIC.
+    fn resampled(image: &[f32], [rows, columns]: [usize; 2], scale: f64, [height, width]: [usize; 2]) -> Vec<f32> {
+        let cubic = |x: f64| match x.abs() {
+            x if x < 1.0 => (1.5 * x - 2.5) * x * x + 1.0,
+            x if x < 2.0 => ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0,
+            _ => 0.0,
         };
-        // Two groups swap places, a third comes and goes.
-        for step in 0..1000 {
-            let at = |step: i32| [f64::from(step) * 1e-3, 1.0 - f64::from(step) * 1e-3, 0.4, 0.45];
-            let sum: f64 = (0..4).map(|group| share(&at(step), group)).sum();
-            assert!((sum - 1.0).abs() < 1e-12, "step {step}: {sum}");
-            for group in 0..4 {
-                let jump = (share(&at(step), group) - share(&at(step + 1), group)).abs();
-                assert!(jump < 0.05, "group {group} jumps by {jump} at step {step}");
-            }
-        }
+        let taps = |from: usize, to: usize, pixel: usize| {
+            let centre = (pixel as f64 + 0.5 - to as f64 / 2.0) * scale + from as f64 / 2.0 - 0.5;
+            let weights: Vec<f64> = (0..from).map(|i| cubic((i as f64 - centre) / scale.max(1.0))).collect();
+            let sum: f64 = weights.iter().sum();
+            weights.into_iter().map(|weight| weight / sum).collect::<Vec<f64>>()
+        };
+        let across: Vec<Vec<f64>> = (0..width).map(|pixel| taps(columns, width, pixel)).collect();
+        let down: Vec<Vec<f64>> = (0..height).map(|pixel| taps(rows, height, pixel)).collect();
+        let pixel = |row: usize, column: usize, channel: usize| {
+            let value = |y: usize, x: usize| f64::from(image[(y * columns + x) * 3 + channel]);
+            let line =
+                |y: usize| across[column].iter().enumerate().map(|(x, weight)| weight * value(y, x)).sum::<f64>();
+            down[row].iter().enumerate().map(|(y, weight)| weight * line(y)).sum::<f64>() as f32
+        };
+        (0..height * width * 3).map(|i| pixel(i / 3 / width, i / 3 % width, i % 3)).collect()
+    }
+
+    /// Returns the middle columns of a frame.
+    fn middle(frame: &[f32], width: usize, columns: usize) -> Vec<f32> {
+        let left = (width - columns) / 2;
+        frame.chunks(width * 3).flat_map(|row| &row[left * 3..][..columns * 3]).copied().collect()
     }
 
     #[test]
-    fn every_second_pixel_of_a_frame_of_twice_the_size_is_a_frame_of_the_trained_size() {
+    fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
         let device = Device::flex();
-        let config = ModelConfig { patch_grids: PatchGrids::Four, ..encoded(CameraEncoding::Gta) };
-        let renderer = Clift::new(&config, 3, &device).renderer;
-        let scene = whole_scene(&renderer, &config);
-        let mut scene_renderer =
-            SceneRenderer::new(&scene, renderer, SelectionPreset::default().rules(), &device).unwrap();
-        let [large, small] = [camera(0.1, 0.2).resized([16, 24], [32, 48]), camera(0.1, 0.2)];
-        let large = scene_renderer.render(&[large], 32, 48, 12).unwrap().remove(0).pixels;
-        for (row, column) in [(0, 0), (1, 0), (1, 1)] {
-            // Pixel (0, 0) of the large frame is a quarter of a small pixel above and left of the small one's center.
-            let shift = |phase: usize| 0.25 - 0.5 * phase as f64;
-            let mut view = small;
-            view.intrinsics.cx += shift(column);
-            view.intrinsics.cy += shift(row);
-            let alone = scene_renderer.render(&[view], 16, 24, 12).unwrap().remove(0).pixels;
-            for (i, expected) in alone.as_chunks::<3>().0.iter().enumerate() {
-                let at = 3 * ((2 * (i / 24) + row) * 48 + 2 * (i % 24) + column);
-                let error = large[at..at + 3].iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-                assert!(error < 1e-5, "{error} at pixel {i} of phase {row}, {column}");
+        // The trained image has 24 x 16 pixels; sizes are height and width.
+        let sizes: [[usize; 2]; 20] = [
+            [8, 12],
+            [12, 18],
+            [14, 21],
+            [16, 24],
+            [17, 25],
+            [20, 30],
+            [24, 36],
+            [31, 47],
+            [32, 48],
+            [40, 60],
+            [48, 72],
+            [64, 96],
+            [128, 192],
+            [16, 12],
+            [40, 40],
+            [64, 24],
+            [16, 36],
+            [24, 60],
+            [32, 128],
+            [48, 192],
+        ];
+        for (encoding, grids) in [
+            (CameraEncoding::Plucker, PatchGrids::One),
+            (CameraEncoding::Gta, PatchGrids::Two),
+            (CameraEncoding::Prope, PatchGrids::Four),
+        ] {
+            let config = ModelConfig { patch_grids: grids, ..encoded(encoding) };
+            let renderer = Clift::new(&config, 3, &device).renderer;
+            let scene = whole_scene(&renderer, &config);
+            let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
+            let mut frame = |size: [usize; 2], count| {
+                renderer.reset();
+                let view = camera(0.1, 0.2).resized([16, 24], size);
+                renderer.render(&[view], size[0], size[1], count).unwrap().remove(0).pixels
+            };
+            for (size, count) in sizes.into_iter().flat_map(|size| [(size, 12), (size, 5)]) {
+                let [height, width] = size;
+                let trained = frame([16, 24], count);
+                // The columns of the frame inside of the trained field of view, in the middle. Those of a wide frame mix with
+                // others within the reach of the filter, two pixels.
+                let inside = height * 3 / 2;
+                let reach = 2 * height.div_ceil(8);
+                let columns = if width > inside { inside - (width - inside) % 2 - reach } else { width };
+                // Of a wide frame other tokens may be selected.
+                if width > inside + 1 && count < 12 {
+                    continue;
+                }
+                let expected = resampled(&trained, [16, 24], 16.0 / height as f64, [height, columns]);
+                let got = middle(&frame(size, count), width, columns);
+                let db = psnr(&got, &expected).unwrap();
+                assert!(db >= 45.0, "{encoding:?}, {size:?}, {count} tokens: {db} dB");
             }
         }
     }
 
     #[test]
-    fn larger_frames_are_fewer_per_call() {
-        let patches = |height: usize, width: usize| height / 8 * (width / 8);
-        let sizes = [(512, 512), (1024, 1024), (2048, 1024), (1 << 14, 1 << 14), (0, 8)];
-        assert_eq!(sizes.map(|(height, width)| frames_per_call(patches(height, width))), [8, 2, 1, 1, 8]);
+    fn frames_of_any_size_are_bounded_in_memory() {
+        let sizes = [(16, 24), (512, 512), (1024, 1024), (2048, 2048), (1 << 14, 1 << 14), (0, 8)];
+        assert_eq!(sizes.map(|(height, width)| frames_per_call(height, width)), [8, 8, 2, 1, 1, 8]);
+        assert_eq!([[8, 8], [64, 64], [128, 128], [512, 512]].map(images_per_call), [8, 8, 2, 1]);
     }
 
     #[test]

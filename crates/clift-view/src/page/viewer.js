@@ -8,22 +8,20 @@ import { CameraPath, PATH_FPS, poseFile } from "./path.js";
 
 /** Milliseconds without a change after which the camera rests. */
 const REST_MS = 160;
-/** Small pictures fill the stage less: pixels of the picture have at most this many of the screen .. */
-const LARGEST_PIXEL = 9;
-/** .. unless the picture would take less than this share of the stage. */
-const SMALLEST_SHARE = 0.66;
 /** Milliseconds between pictures that belong to one movement. */
 const MOVING_MS = 400;
 /** Pictures whose times make the displayed rate. */
 const RATE_PICTURES = 20;
 
 const $ = (id) => document.getElementById(id);
+/** The rendered and the true image in their own pixels; `shown` has them in pixels of the screen. */
 const picture = $("picture");
 const truth = $("truth");
+const shown = $("shown");
 
 const view = {
   hello: null, scene: null, camera: null, distance: 2, dragMode: "orbit", selection: "scaled", precision: null,
-  overlay: "none", compareFrame: null, comparison: null, bits: null, sceneKey: null,
+  overlay: "none", compareFrame: null, compareMode: "Wipe", comparison: null, bits: null, sceneKey: null,
 };
 const path = new CameraPath();
 const map = new SceneMap($("map"));
@@ -195,7 +193,7 @@ async function onComparison(header, parts) {
   truth.getContext("2d").drawImage(image, 0, 0);
   // The exact camera of the frame, with the intrinsics of its image.
   view.camera = ofReply(header.camera);
-  truth.hidden = $("wipe").hidden = false;
+  $("wipe").hidden = false;
   layout();
   changed();
 }
@@ -206,20 +204,41 @@ async function onComparison(header, parts) {
 function layout() {
   const stage = $("stage");
   const [width, height] = view.scene?.size ?? [1, 1];
-  const fitting = Math.min(stage.clientWidth / width, stage.clientHeight / height) * 0.96;
-  const unit = Math.min(fitting, Math.max(LARGEST_PIXEL, SMALLEST_SHARE * fitting));
-  for (const canvas of [picture, truth]) {
-    canvas.style.width = `${Math.round(width * unit)}px`;
-    canvas.style.height = `${Math.round(height * unit)}px`;
-  }
-  const share = $("wipe-at").valueAsNumber / 1000;
-  truth.style.clipPath = `inset(0 ${100 * (1 - share)}% 0 0)`;
+  const unit = Math.min(stage.clientWidth / width, stage.clientHeight / height) * 0.96;
+  const [shownWidth, shownHeight] = [width, height].map((side) => Math.max(1, Math.round(side * unit)));
+  Object.assign(shown.style, { width: `${shownWidth}px`, height: `${shownHeight}px` });
+  const ratio = devicePixelRatio || 1;
+  [shown.width, shown.height] = [shownWidth, shownHeight].map((side) => Math.round(side * ratio));
+  paint();
   const wipe = $("wipe");
   Object.assign(wipe.style, {
-    left: `${picture.offsetLeft}px`, top: `${picture.offsetTop}px`,
-    width: picture.style.width, height: picture.style.height,
+    left: `${shown.offsetLeft}px`, top: `${shown.offsetTop}px`, width: shown.style.width, height: shown.style.height,
   });
-  $("wipe-line").style.left = `${100 * share}%`;
+  $("wipe-line").style.left = `${$("wipe-at").valueAsNumber / 10}%`;
+}
+
+/** Draws the picture in pixels of the screen, with the true image left of the wipe or subtracted. */
+function paint() {
+  const context = shown.getContext("2d");
+  const { width, height } = shown;
+  context.imageSmoothingEnabled = !$("pixels").checked;
+  context.imageSmoothingQuality = "high"; // bicubic
+  context.drawImage(picture, 0, 0, width, height);
+  if ($("wipe").hidden) return;
+  context.save();
+  if (view.compareMode === "Wipe") {
+    context.beginPath();
+    context.rect(0, 0, (width * $("wipe-at").valueAsNumber) / 1000, height);
+    context.clip();
+    context.drawImage(truth, 0, 0, width, height);
+  } else {
+    context.globalCompositeOperation = "difference";
+    context.drawImage(truth, 0, 0, width, height);
+    // Added to itself twice: four times as bright.
+    context.globalCompositeOperation = "lighter";
+    for (let i = 0; i < 2; i++) context.drawImage(shown, 0, 0);
+  }
+  context.restore();
 }
 
 function drawMap() {
@@ -306,7 +325,7 @@ function fillPanel(header, share) {
     ? `Fixed in the scene file: ${header.tokens}.`
     : `Of ${header.num_patches} patches of the context views; another number encodes the scene again.`;
   const sizes = header.sizes.map((size, i) => new Option(size.join(" × "), i));
-  const former = $("size").options.length === sizes.length ? Number($("size").value) : header.default_size;
+  const former = $("size").options.length === sizes.length ? Number($("size").value) : 0;
   $("size").replaceChildren(...sizes);
   $("size").value = former;
   $("compare-section").hidden = header.frames.length === 0;
@@ -428,7 +447,8 @@ function startComparing(frame) {
 
 function stopComparing() {
   view.compareFrame = null;
-  truth.hidden = $("wipe").hidden = true;
+  $("wipe").hidden = true;
+  paint();
   $("compare").setAttribute("aria-pressed", "false");
 }
 
@@ -561,7 +581,12 @@ $("size").onchange = () => {
   updateCommand();
   changed();
 };
-$("pixels").onchange = () => $("stage").classList.toggle("pixels", $("pixels").checked);
+$("pixels").onchange = paint;
+segments("compare-mode", ["Wipe", "Difference"], view.compareMode, (value) => {
+  view.compareMode = value;
+  $("wipe").classList.toggle("difference", value === "Difference");
+  paint();
+});
 $("compare").onclick = toggleComparing;
 $("frame").oninput = () => startComparing($("frame").valueAsNumber);
 $("wipe-at").oninput = layout;

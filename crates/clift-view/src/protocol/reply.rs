@@ -30,9 +30,8 @@ pub struct OpenedScene<'a> {
     pub key: &'a str,
     /// Width and height of the context views in pixels.
     pub size: [usize; 2],
-    /// Offered sizes, and the position of the context views' size.
+    /// Offered sizes, the first that of the context views.
     pub sizes: &'a [[usize; 2]],
-    pub default_size: usize,
     pub patch: usize,
     /// Stored tokens, and the offered numbers.
     pub stored: usize,

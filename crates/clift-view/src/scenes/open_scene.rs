@@ -2,16 +2,16 @@
 
 use burn::tensor::Device;
 use clift_core::{Camera, Intrinsics, IntrinsicsNorm, RgbImage, focus_distance, mean_intrinsics};
-use clift_eval::{Canvas, available_bytes};
-use clift_model::{DeviceName, Renderer, SelectionPreset};
-use clift_scene::{Scene, SceneRenderer, TokenCoding, frame_bytes};
+use clift_eval::Canvas;
+use clift_model::{Renderer, SelectionPreset};
+use clift_scene::{Scene, SceneRenderer, TokenCoding};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};
 use crate::scenes::true_frames::TrueFrame;
 
-/// Offered sizes over the size of the context views.
-const SIZE_FACTORS: [f64; 5] = [0.5, 0.75, 1.0, 2.0, 4.0];
+/// Offered sizes over the size of the context views. A smaller image would take as long.
+const SIZE_FACTORS: [usize; 3] = [1, 2, 4];
 const MAX_SIDE_PX: usize = 1024;
 
 /// Origin of a scene's images, clusters and counts.
@@ -47,13 +47,7 @@ pub struct OpenScene {
 
 impl OpenScene {
     /// Copies a scene to a device, and renders its context views if it has no images.
-    pub fn new(
-        scene: Scene,
-        renderer: Renderer,
-        mut origin: SceneOrigin,
-        device: &Device,
-        name: DeviceName,
-    ) -> Result<Self, ViewError> {
+    pub fn new(scene: Scene, renderer: Renderer, mut origin: SceneOrigin, device: &Device) -> Result<Self, ViewError> {
         let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::default().rules(), device)?;
         let context_images = if let Some(images) = origin.context_images.take() {
             images
@@ -62,7 +56,7 @@ impl OpenScene {
             let images = views.iter().map(|view| Canvas::from_unit(&view.pixels, scene.height, scene.width));
             images.collect::<Result<_, _>>()?
         };
-        Ok(Self { sizes: sizes(&scene, name), scene, renderer, origin, context_images })
+        Ok(Self { sizes: sizes(&scene), scene, renderer, origin, context_images })
     }
 
     /// Returns the message that shows the scene to the page.
@@ -80,7 +74,6 @@ impl OpenScene {
             key: &scene.key,
             size,
             sizes,
-            default_size: sizes.iter().position(|one| *one == size).unwrap_or_default(),
             patch: scene.model.patch_size,
             stored: scene.num_tokens(),
             storage_counts: &origin.storage_counts,
@@ -119,25 +112,9 @@ pub fn png(image: &Canvas) -> Result<Vec<u8>, ViewError> {
     Ok(clift_data::encode_png(&image)?)
 }
 
-/// Returns the sizes of whole patches that fit into half of the memory.
-fn sizes(scene: &Scene, device: DeviceName) -> Vec<[usize; 2]> {
+/// Returns the offered sizes, the first that of the context views.
+fn sizes(scene: &Scene) -> Vec<[usize; 2]> {
     let own = [scene.width, scene.height];
-    let patch = scene.model.patch_size;
-    let mut sizes: Vec<[usize; 2]> = SIZE_FACTORS
-        .iter()
-        .map(|factor| own.map(|side| ((side as f64 * factor / patch as f64).round() as usize).max(1) * patch))
-        .filter(|size| *size == own || (is_similar(*size, own) && size.iter().all(|side| *side <= MAX_SIDE_PX)))
-        .filter(|size| {
-            let needed = frame_bytes(scene, &scene.model, 1, [size[1], size[0]]);
-            *size == own || available_bytes(device).is_none_or(|available| needed <= available / 2)
-        })
-        .collect();
-    sizes.dedup();
-    sizes
-}
-
-/// Whether rounding to whole patches keeps the proportions within 5 %.
-fn is_similar([width, height]: [usize; 2], own: [usize; 2]) -> bool {
-    let ratio = (width * own[1]) as f64 / (height * own[0]) as f64;
-    (0.95..1.05).contains(&ratio)
+    let sizes = SIZE_FACTORS.map(|factor| own.map(|side| factor * side)).into_iter();
+    sizes.filter(|size| *size == own || size.iter().all(|side| *side <= MAX_SIDE_PX)).collect()
 }

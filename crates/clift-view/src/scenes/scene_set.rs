@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use clift_data::ClipReader;
 use clift_eval::file_name;
-use clift_model::{DeviceName, Renderer, TokenCount, TrainedModel};
+use clift_model::{Renderer, TokenCount, TrainedModel};
 use clift_scene::{ContextChoice, Contexts, EncodeOptions, EncodedScene, Scene, TokenCoding, TokenFormat, encode};
 
 use crate::error::ViewError;
@@ -77,7 +77,7 @@ impl SceneSet {
     }
 
     /// Opens a scene on the device of its model.
-    pub(crate) fn open(&self, request: OpenRequest, device: &Device, name: DeviceName) -> Result<OpenScene, ViewError> {
+    pub(crate) fn open(&self, request: OpenRequest, device: &Device) -> Result<OpenScene, ViewError> {
         match self {
             Self::File(file) => {
                 check_position("scene", request.scene, 1)?;
@@ -93,9 +93,9 @@ impl SceneSet {
                     encode_command: None,
                     render_command: command("clift render", render_args),
                 };
-                OpenScene::new(scene.clone(), renderer.clone(), origin, device, name)
+                OpenScene::new(scene.clone(), renderer.clone(), origin, device)
             }
-            Self::Run(run) => run.open(request, device, name),
+            Self::Run(run) => run.open(request, device),
         }
     }
 
@@ -109,7 +109,7 @@ impl SceneSet {
 }
 
 impl RunScenes {
-    fn open(&self, request: OpenRequest, device: &Device, name: DeviceName) -> Result<OpenScene, ViewError> {
+    fn open(&self, request: OpenRequest, device: &Device) -> Result<OpenScene, ViewError> {
         check_position("scene", request.scene, self.items.len())?;
         let (index, context) = &self.items[request.scene];
         let clift_data::ClipOptions { width, height, .. } = self.reader.options;
@@ -148,7 +148,7 @@ impl RunScenes {
             encode_command: Some(command("clift encode", &encode_args)),
             render_command: command("clift render", &render_args),
         };
-        OpenScene::new(scene, self.model.network.renderer.clone(), origin, device, name)
+        OpenScene::new(scene, self.model.network.renderer.clone(), origin, device)
     }
 
     /// Returns the offered counts of a scene, ascending; all tokens are always offered.

@@ -102,7 +102,7 @@ impl ViewServer {
             clients.close();
             result
         });
-        RenderLoop::new(scenes, device, device_name).run(&clients);
+        RenderLoop::new(scenes, device).run(&clients);
         let served = serving.join().unwrap_or_else(|_| Err(std::io::Error::other("the thread panicked")));
         served.map_err(|source| ViewError::Serve { source })
     }

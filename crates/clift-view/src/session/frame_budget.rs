@@ -1,4 +1,4 @@
-//! Holds a time per frame while the camera moves: fewer tokens first, then smaller frames.
+//! Holds a time per frame while the camera moves: fewer tokens first, then smaller frames, down to the trained size.
 
 /// Steps of the number of tokens, each 3/4 of the one before: down to 13 %.
 const TOKEN_STEPS: usize = 7;

@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use clift_core::RgbImage;
 use clift_data::{encode_jpeg, encode_png};
 use clift_eval::Canvas;
-use clift_model::{DeviceName, PatchGrids, SelectionPreset, psnr};
+use clift_model::{PatchGrids, SelectionPreset, psnr};
 use clift_scene::SceneRenderer;
 
 use crate::error::ViewError;
@@ -32,7 +32,6 @@ const JPEG_QUALITY: u8 = 90;
 pub struct RenderLoop {
     scenes: SceneSet,
     device: Device,
-    name: DeviceName,
     /// The scenes opened last, the latest at the end.
     open: Vec<Arc<OpenScene>>,
     /// True images read last, by scene and position of the frame.
@@ -49,8 +48,8 @@ struct ClientView {
 }
 
 impl RenderLoop {
-    pub fn new(scenes: SceneSet, device: Device, name: DeviceName) -> Self {
-        Self { scenes, device, name, open: Vec::new(), true_images: Vec::new(), views: HashMap::new() }
+    pub fn new(scenes: SceneSet, device: Device) -> Self {
+        Self { scenes, device, open: Vec::new(), true_images: Vec::new(), views: HashMap::new() }
     }
 
     /// Works until the clients are closed.
@@ -79,7 +78,7 @@ impl RenderLoop {
         };
         let scene = match self.open.iter().position(is_wanted) {
             Some(position) => self.open.remove(position),
-            None => Arc::new(self.scenes.open(request, &self.device, self.name)?),
+            None => Arc::new(self.scenes.open(request, &self.device)?),
         };
         if self.open.len() >= KEPT_SCENES {
             self.open.remove(0);

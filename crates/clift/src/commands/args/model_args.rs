@@ -2,7 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{DatasetRoot, FileOptions, OpenedSource, SourceKind, SourceOptions, Split, open_dataset, open_source};
+use clift_data::{
+    DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset, open_source,
+};
 use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
 use clift_scene::ContextChoice;
 use clift_train::{Config, Override};
@@ -18,6 +20,9 @@ const SHIPPED_MODEL: &str = "models/rooms";
 /// Environment variable with the path of another model to use where none is named.
 const MODEL_VARIABLE: &str = "CLIFT_MODEL";
 
+/// Relative difference in pixels per angle up to which images count as those of the training.
+const MAX_DENSITY_DIFFERENCE: f64 = 0.05;
+
 /// A trained model, its config, and the folder of scenes that replaces the data of the config.
 pub struct ModelArgs {
     /// The model as given, or the shipped one.
@@ -25,6 +30,8 @@ pub struct ModelArgs {
     pub path: ModelPath,
     pub config: Config,
     overrides: Vec<Override>,
+    /// Width and height of the images that the network was trained on.
+    trained_size: [usize; 2],
     /// Data set or capture beside the model.
     pub folder: Option<PathBuf>,
 }
@@ -46,14 +53,10 @@ impl ModelArgs {
             usage_bail!("{}: no such file or folder", model.display());
         }
         let path = ModelPath::find(model)?;
-        let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
+        let read = |set: &[String]| read_config(&path.dir.join("config.toml"), set, |_| Ok(()));
+        let (mut config, overrides) = read(&args.set)?;
         check_network(&config.model, &path)?;
-        let sizes = overrides.iter().filter(|change| ["data.width", "data.height"].contains(&change.key.as_str()));
-        for Override { key, from, to, .. } in sizes {
-            if let Some(trained) = from.as_ref().filter(|from| *from != to) {
-                print_warning(format!("--set {key}: the network was trained with {trained}; other sizes lose quality"));
-            }
-        }
+        let trained_size = image_size(&if overrides.is_empty() { config.clone() } else { read(&[])?.0 });
         config.device = args.device.unwrap_or(config.device);
         let folder = folder.map(Path::to_path_buf);
         if folder.is_some() {
@@ -61,11 +64,17 @@ impl ModelArgs {
             config.data.root.clone_from(&folder);
         }
         config.validate()?;
-        Ok(Self { given: model.into(), path, config, overrides, folder })
+        Ok(Self { given: model.into(), path, config, overrides, trained_size, folder })
     }
 
     /// Opens one split of the folder, or of the data of the config.
     pub fn open_data(&self, split: Split) -> anyhow::Result<OpenedSource> {
+        let opened = self.open_any(split)?;
+        self.check_density(opened.source.as_ref())?;
+        Ok(opened)
+    }
+
+    fn open_any(&self, split: Split) -> anyhow::Result<OpenedSource> {
         let Some(folder) = &self.folder else {
             let mut counter = ScanCounter::default();
             return Ok(open_dataset(&self.config.data, split, &mut |done, total| counter.set(done, total))?);
@@ -82,6 +91,35 @@ impl ModelArgs {
         Ok(opened)
     }
 
+    /// Refuses images of another number of pixels per angle than those of the training, of which the network makes noise.
+    /// The first image stands for all.
+    fn check_density(&self, source: &dyn SceneSource) -> anyhow::Result<()> {
+        let (size, trained) = (image_size(&self.config), self.trained_size);
+        if size == trained || source.num_scenes() == 0 {
+            return Ok(());
+        }
+        let image = source.image_size(0, 0)?;
+        // An image is reduced until it just covers the size.
+        let scale = |size: [usize; 2]| (0..2).map(|side| size[side] as f64 / image[side] as f64).fold(0.0, f64::max);
+        let words = |[width, height]: [usize; 2]| format!("{width} x {height}");
+        let (density, patch) = (scale(size) / scale(trained), self.config.model.patch_size);
+        if (density - 1.0).abs() > MAX_DENSITY_DIFFERENCE {
+            let widest = image.map(|side| (side as f64 * scale(trained) / patch as f64) as usize * patch);
+            usage_bail!(
+                "--set data.width, data.height: at {} pixels, images of {} have {density:.2} times as many pixels per \
+                 angle as the images of {} that the network was trained on, from which it renders noise; write at most \
+                 {}, and choose the size of frames with `clift render --size`",
+                words(size),
+                words(image),
+                words(trained),
+                words(widest)
+            );
+        }
+        let (size, trained) = (words(size), words(trained));
+        print_warning(format!("the network was trained on images of {trained}; images of {size} may lose quality"));
+        Ok(())
+    }
+
     /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder.
     pub fn context(&self) -> ContextChoice {
         let trained = self.config.data.views.max_context;
@@ -95,6 +133,11 @@ impl ModelArgs {
     pub fn open(&self) -> Result<TrainedModel, ModelError> {
         TrainedModel::open_with(&self.path, &self.config.model, &self.config.device.open()?)
     }
+}
+
+/// Returns the width and the height of the images that a config reads.
+fn image_size(config: &Config) -> [usize; 2] {
+    [config.data.width, config.data.height]
 }
 
 /// Refuses another network than that of the weights. Tensor shapes do not determine the number of heads nor the camera

@@ -39,7 +39,7 @@ pub struct RenderArgs {
     /// Average 1, 2 or 4 renderings with shifted patches [default: the model's]
     #[arg(long, value_name = "COUNT")]
     pub patch_grids: Option<PatchGrids>,
-    /// Width and height of a frame in pixels, multiples of the patch [default: context]
+    /// Width and height of a frame in pixels [default: context]
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<[usize; 2]>,
     /// Number of frames of `interpolate` and `orbit` [default: 60]

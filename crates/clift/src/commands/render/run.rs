@@ -1,6 +1,5 @@
 //! `clift render`.
 
-use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -8,7 +7,7 @@ use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_pat
 use clift_data::read_poses;
 use clift_eval::available_bytes;
 use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, TokenCount};
-use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
+use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, check_frames, frame_bytes, load_renderer};
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};
@@ -53,21 +52,19 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let patch_grids = args.patch_grids.unwrap_or(scene.model.patch_grids);
     let model = ModelConfig { patch_grids, ..scene.model.clone() };
     model.validate()?;
-    check_size(&scene, &model, [width, height], args.render.is_some(), device)?;
-    let effect = match height.cmp(&scene.height) {
-        Ordering::Less => Some("lose quality"),
-        Ordering::Equal => None,
-        Ordering::Greater => Some("show no more detail"),
-    };
-    if let Some(effect) = effect {
-        let trained = format!("{} x {}", scene.width, scene.height);
-        print_warning(format!("the network was trained on images of {trained}; frames of {width} x {height} {effect}"));
+    check_size(&scene, &model, [width, height], device)?;
+    if height > scene.height {
+        print_warning(format!(
+            "the network was trained on images of {} x {}; frames of {width} x {height} show no more detail",
+            scene.width, scene.height
+        ));
     }
     frames::check_out(&args.out, args.force)?;
     if let Some(video) = &args.video {
         OutputFile::new(video, args.force, &[&args.scene])?;
     }
     let views = path_cameras(&scene, args, height, width)?;
+    check_frames(&scene, &views, [height, width])?;
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let stop = interrupt::flag()?;
     let opened = device.open()?;
@@ -126,21 +123,17 @@ pub fn scene_weights(scene: &Scene, file: &Path, model: Option<&Path>) -> anyhow
     Ok(weights)
 }
 
-/// Refuses sizes that are not multiples of the patch, exceed the limit of images or exceed the available memory.
+/// Refuses sizes that exceed the limit of images or the available memory.
 fn check_size(
     scene: &Scene,
     model: &ModelConfig,
     [width, height]: [usize; 2],
-    selects: bool,
     device: DeviceName,
 ) -> anyhow::Result<()> {
     if width.max(height) > MAX_SIDE_PX {
         usage_bail!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels per side");
     }
-    let num_patches = model.num_patches(1, height, width)?;
-    // With token selection every frame has its own tokens and is rendered alone.
-    let num_frames = if selects { 1 } else { frames_per_call(num_patches) };
-    let needed = frame_bytes(scene, model, num_frames, [height, width]);
+    let needed = frame_bytes(scene, model, [height, width]);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (file_size(needed), file_size(available));
         usage_bail!(
