@@ -36,7 +36,7 @@ mod torch;
 pub use config::DataConfig;
 pub use dataset::{half_resolution_clips, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
-pub use scene_source::{SceneSource, Split};
+pub use scene_source::{SceneSource, Split, is_held_out};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
 
 // Layouts on disk, and synthetic scenes.
@@ -47,9 +47,9 @@ pub use sources::filters::SceneFilters;
 pub use sources::keys::is_dl3dv_key;
 pub use sources::kind::SourceKind;
 pub use sources::open::{OpenedSource, open_source};
-pub use sources::options::{FileOptions, SourceOptions};
+pub use sources::options::{FileOptions, PosesFrom, SourceOptions};
 pub use sources::photos::image_cache::ImageCacheConfig;
-pub use sources::subset::{SceneSubset, is_held_out};
+pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
 pub use synthetic::config::{Look, SyntheticConfig};
 pub use synthetic::source::SyntheticSource;

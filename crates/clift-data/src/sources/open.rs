@@ -147,6 +147,8 @@ impl SplitFolder<'_> {
             photos: PhotoOptions {
                 image_folder: files.image_folder.clone(),
                 first_folders: if is_dl3dv { DL3DV_FOLDERS } else { &[] },
+                min_size: options.min_size,
+                poses_from: files.poses_from,
                 undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
             },
             filters: options.filters.clone(),

@@ -20,9 +20,23 @@ pub struct FileOptions {
     pub image_folder: Option<String>,
     /// Whether images are undistorted; by default only in `captures`.
     pub undistort: Option<bool>,
+    /// Pixels from which the poses were computed, for photos with an EXIF orientation whose cameras fit both: `stored`, as by
+    /// COLMAP, or `turned` by the orientation.
+    pub poses_from: PosesFrom,
     /// Whether scenes of `re10k_txt` and `dl3dv` with missing images are used without these frames. Frame indices then
     /// differ from those of published evaluation indices.
     pub keep_incomplete: bool,
+}
+
+/// Pixels of a photo with an EXIF orientation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PosesFrom {
+    /// Pixels as the file stores them.
+    #[default]
+    Stored,
+    /// Pixels turned by the orientation.
+    Turned,
 }
 
 /// Options of opening a data set on disk.
