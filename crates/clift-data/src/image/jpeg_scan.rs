@@ -109,7 +109,8 @@ impl Frame {
                 return Err(BAD_SEGMENT);
             }
             entries.resize(1 << 16, (0, 0));
-            let table = self.tables.get_mut(usize::from(kind >> 4)).and_then(|tables| tables.get_mut(usize::from(kind & 15)));
+            let table =
+                self.tables.get_mut(usize::from(kind >> 4)).and_then(|tables| tables.get_mut(usize::from(kind & 15)));
             *table.ok_or(BAD_SEGMENT)? = Some(Table(entries));
             segment = rest;
         }
@@ -228,7 +229,8 @@ impl Reader<'_> {
         if self.num_bits < 16 {
             self.fill();
         }
-        let next = if self.num_bits < 16 { self.bits << (16 - self.num_bits) } else { self.bits >> (self.num_bits - 16) };
+        let next =
+            if self.num_bits < 16 { self.bits << (16 - self.num_bits) } else { self.bits >> (self.num_bits - 16) };
         match entries[next as usize & 0xffff] {
             (0, _) => Err(if self.num_bits < 16 { ENDS_EARLY } else { BAD_CODE }),
             (length, symbol) => {
@@ -238,7 +240,12 @@ impl Reader<'_> {
         }
     }
 
-    fn block(&mut self, [direct, table]: [Option<&Table>; 2], range: Range, coded: &mut u64) -> Result<(), &'static str> {
+    fn block(
+        &mut self,
+        [direct, table]: [Option<&Table>; 2],
+        range: Range,
+        coded: &mut u64,
+    ) -> Result<(), &'static str> {
         let Range { first, last, refines } = range;
         let mut k = first;
         if k == 0 {

@@ -121,7 +121,8 @@ impl ImageCache {
         let path = std::path::absolute(&photo.path).ok()?;
         let Photo { undistortion, shape, view_turn, poses_from, .. } = photo;
         let (path, bytes) = (path.display(), metadata.len());
-        let key = format!("{path}\n{bytes} {time:?} {undistortion:?} {shape:?} {view_turn:?} {poses_from:?} {:?}", self.size);
+        let key =
+            format!("{path}\n{bytes} {time:?} {undistortion:?} {shape:?} {view_turn:?} {poses_from:?} {:?}", self.size);
         Some(format!("{}.{EXTENSION}", hex::encode(&Sha256::digest(key)[..16])))
     }
 

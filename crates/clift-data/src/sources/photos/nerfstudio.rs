@@ -89,7 +89,8 @@ impl Document {
         let train = names(&self.train_filenames);
         let held_out = &names(&self.val_filenames) | &names(&self.test_filenames);
         let has_list = !(train.is_empty() && held_out.is_empty());
-        has_list.then(|| move |name: &str| if train.is_empty() { held_out.contains(name) } else { !train.contains(name) })
+        has_list
+            .then_some(move |name: &str| if train.is_empty() { held_out.contains(name) } else { !train.contains(name) })
     }
 }
 
@@ -212,7 +213,8 @@ impl<'a> Optics<'a> {
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
-    let document: Document = parse(&text).map_err(|error| bad(format!("expected the format of nerfstudio, got {error}")))?;
+    let document: Document =
+        parse(&text).map_err(|error| bad(format!("expected the format of nerfstudio, got {error}")))?;
     drop(text);
     let folder = folder_of(path);
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
@@ -259,7 +261,9 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     if num_scaled.0 > 0 {
         scene.notes.push(format!(
             "{} with a scaled rotation in {}: the scale, {:.3}, was divided out",
-            plural(num_scaled.0, "frame"), path.display(), num_scaled.1
+            plural(num_scaled.0, "frame"),
+            path.display(),
+            num_scaled.1
         ));
     }
     if num_guessed.0 > 0 {
@@ -267,7 +271,8 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         scene.notes.push(format!(
             "{} without w and h in {}, smaller than their principal point says: the intrinsics are taken as those of \
              images of {width:.0}x{height:.0}; write w and h",
-            plural(count, "image"), path.display()
+            plural(count, "image"),
+            path.display()
         ));
     }
     scene.num_without_camera = images.num_unrequested();

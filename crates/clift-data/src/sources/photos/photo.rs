@@ -82,7 +82,7 @@ pub(crate) struct Turn {
 }
 
 impl Turn {
-    pub fn is_any(&self) -> bool {
+    pub fn is_any(self) -> bool {
         self.pixels != Orientation::NoTransforms || self.view != Orientation::NoTransforms
     }
 }
@@ -170,7 +170,8 @@ impl Photo {
         let image = decode_image(&bytes, key, frame)?;
         let stored = [image.width, image.height];
         let is_plain = self.poses_from == PosesFrom::Stored && self.fits(stored);
-        let pixels = if is_plain { Orientation::NoTransforms } else { self.turn(stored, exif_orientation(&bytes))?.pixels };
+        let pixels =
+            if is_plain { Orientation::NoTransforms } else { self.turn(stored, exif_orientation(&bytes))?.pixels };
         let image = apply_orientation(image, pixels);
         let image = match &self.undistortion {
             Some(undistortion) => undistortion.apply(&image),
@@ -213,8 +214,7 @@ impl Photo {
             return Err(DataError::WrongAspect { width, height, camera_aspect, path: self.path.clone() });
         }
         let turns_pixels = fits_turned && (!fits_stored || self.poses_from == PosesFrom::Turned);
-        let is_rotation =
-            matches!(tag, Orientation::Rotate90 | Orientation::Rotate180 | Orientation::Rotate270);
+        let is_rotation = matches!(tag, Orientation::Rotate90 | Orientation::Rotate180 | Orientation::Rotate270);
         let none = Orientation::NoTransforms;
         Ok(Turn {
             pixels: if turns_pixels { tag } else { none },

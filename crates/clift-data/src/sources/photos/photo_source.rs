@@ -204,9 +204,13 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
                 let turns_view = turn.view != Orientation::NoTransforms;
                 let turns_pixels = turn.pixels != Orientation::NoTransforms;
                 turns.extend(turns_view.then_some((position, turn.view)));
-                let is_counted = [turns_pixels && !turn.is_undecided, turns_view && !turn.is_undecided, turn.is_undecided];
+                let is_counted =
+                    [turns_pixels && !turn.is_undecided, turns_view && !turn.is_undecided, turn.is_undecided];
                 let is_counted = is_counted.into_iter().chain([turn.is_unused]);
-                counts[1..].iter_mut().zip(is_counted).for_each(|(count, is_counted)| *count += usize::from(is_counted));
+                counts[1..]
+                    .iter_mut()
+                    .zip(is_counted)
+                    .for_each(|(count, is_counted)| *count += usize::from(is_counted));
             }
             Err(error) => {
                 let reason = match &error {
@@ -223,7 +227,9 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     }
     if !options.whole_scenes {
         let centres: Vec<DVec3> = photos.iter().map(|photo| photo.camera.c2w.translation).collect();
-        for position in far_cameras(&centres).into_iter().filter(|position| !unusable.contains(position)).collect::<Vec<_>>() {
+        for position in
+            far_cameras(&centres).into_iter().filter(|position| !unusable.contains(position)).collect::<Vec<_>>()
+        {
             missing.push(MissingPhoto { name: names[position].clone(), reason: FAR.into() });
             unusable.push(position);
         }

@@ -61,7 +61,10 @@ fn locate<'a>(times: &[i64], images: &'a [PathBuf]) -> (Vec<Option<&'a PathBuf>>
     if images.len() == times.len() && num_near <= times.len() / 2 {
         return (images.iter().map(Some).collect(), Some("the images are taken in the order of their names".into()));
     }
-    let note = format!("the names of {} differ from the time stamps, by less than half a frame", plural(num_near - num_exact, "image"));
+    let note = format!(
+        "the names of {} differ from the time stamps, by less than half a frame",
+        plural(num_near - num_exact, "image")
+    );
     (near, (num_near > num_exact).then_some(note))
 }
 

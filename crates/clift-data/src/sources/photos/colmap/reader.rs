@@ -28,7 +28,7 @@ pub(crate) fn find_model(folder: &Path) -> Option<PathBuf> {
     largest(models).map(|(model, _)| model)
 }
 
-/// Returns the models in a folder and below it, numbered folders first.
+/// Returns the models in a folder and below it, upper folders first.
 fn models_below(base: &Path) -> Vec<PathBuf> {
     let (mut found, mut folders) = (Vec::new(), VecDeque::from([(base.to_owned(), 0)]));
     while let Some((folder, depth)) = folders.pop_front() {
@@ -108,11 +108,14 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
 fn find_image(image_folder: &Path, name: &str, folders: &mut ImageFolders) -> Result<PathBuf, String> {
     let found = folders.find(&image_folder.join(name));
     found.or_else(|error| {
-        let is_folder = |part: &Component<'_>| {
-            part.as_os_str() == "images" || image_folder.file_name() == Some(part.as_os_str())
-        };
+        let is_folder =
+            |part: &Component<'_>| part.as_os_str() == "images" || image_folder.file_name() == Some(part.as_os_str());
         let below: PathBuf = Path::new(name).components().skip_while(|part| !is_folder(part)).skip(1).collect();
-        if below.as_os_str().is_empty() { Err(error) } else { folders.find(&image_folder.join(below)).map_err(|_| error) }
+        if below.as_os_str().is_empty() {
+            Err(error)
+        } else {
+            folders.find(&image_folder.join(below)).map_err(|_| error)
+        }
     })
 }
 
@@ -136,7 +139,10 @@ fn find_image_folder(folder: &Path, model: &Path, options: &PhotoOptions, folder
 
 /// Returns a note on the choice among several models.
 fn other_models(folder: &Path, model: &Path) -> Vec<String> {
-    let models = BASES.iter().map(|base| models_below(&folder.join(base))).find(|models| models.iter().any(|other| other == model));
+    let models = BASES
+        .iter()
+        .map(|base| models_below(&folder.join(base)))
+        .find(|models| models.iter().any(|other| other == model));
     let models = models.filter(|models| models.len() > 1).unwrap_or_default();
     let counted = largest(models.clone()).map(|(_, count)| {
         let name = model.strip_prefix(folder).unwrap_or(model).display();
