@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::photos::image_cache::ImageCacheConfig;
+use crate::sources::photos::photo::PosesFrom;
 
 /// Paths of the parts of a layout, where they differ from the default.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -26,17 +27,6 @@ pub struct FileOptions {
     /// Whether scenes of `re10k_txt` and `dl3dv` with missing images are used without these frames. Frame indices then
     /// differ from those of published evaluation indices.
     pub keep_incomplete: bool,
-}
-
-/// Pixels of a photo with an EXIF orientation.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PosesFrom {
-    /// Pixels as the file stores them.
-    #[default]
-    Stored,
-    /// Pixels turned by the orientation.
-    Turned,
 }
 
 /// Options of opening a data set on disk.

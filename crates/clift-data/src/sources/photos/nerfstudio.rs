@@ -258,6 +258,11 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
             Err(reason) => scene.skip(name, reason),
         }
     }
+    if held_out.is_some() {
+        let count = scene.photos.iter().filter(|photo| photo.is_held_out == Some(true)).count();
+        let of = plural(scene.photos.len(), "frame");
+        scene.notes.push(format!("{count} of {of} held out by the lists of file names in {}", path.display()));
+    }
     if num_scaled.0 > 0 {
         scene.notes.push(format!(
             "{} with a scaled rotation in {}: the scale, {:.3}, was divided out",

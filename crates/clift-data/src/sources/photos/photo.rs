@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clift_core::{Camera, DMat3, IntrinsicsNorm, Pose, RgbImage};
 use image::metadata::Orientation;
+use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
@@ -13,13 +14,23 @@ use crate::geometry::lens::Lens;
 use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
 use crate::image::jpeg_scan::check_scans;
 use crate::image::undistort::Undistortion;
-use crate::sources::options::PosesFrom;
 
 pub(crate) const MAX_FRAMES: usize = 100_000;
 /// Largest size of an image file, in bytes.
 const MAX_IMAGE_BYTES: u64 = 256 << 20;
 /// Largest relative error of an image's aspect ratio against its camera's: rounding of images a few dozen pixels wide.
 const MAX_SHAPE_ERROR: f64 = 0.02;
+
+/// Pixels of a photo with an EXIF orientation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PosesFrom {
+    /// Pixels as the file stores them.
+    #[default]
+    Stored,
+    /// Pixels turned by the orientation.
+    Turned,
+}
 
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoOptions {
