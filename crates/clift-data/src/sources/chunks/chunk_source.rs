@@ -255,7 +255,10 @@ impl ChunkSource {
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
         let num_frames = if filters.min_frames > 0 { self.num_frames(scene)? } else { 0 };
-        let fov_deg = self.cached(scene).and_then(|cached| cached.fov_deg);
+        let fov_deg = match self.cached(scene) {
+            Some(cached) => cached.fov_deg,
+            None => self.table(scene).ok().and_then(|(_, table)| table.fov_deg),
+        };
         filters.reason_to_skip(num_frames, || fov_deg.map_or_else(|| Ok(widest_fov_deg(&self.cameras(scene)?)), Ok))
     }
 

@@ -48,7 +48,11 @@ impl CachedChunk {
         // Before reading: a file that changes meanwhile is read again at the next opening.
         let stamp = stamp(path).map_err(DataError::io("opening a chunk", path))?;
         let scene = |(key, scene): (&String, &SceneTable)| {
-            let fov_deg = if needs_fov { Some(widest_fov_deg(&scene.read_cameras(path)?)) } else { None };
+            let fov_deg = match (needs_fov, scene.fov_deg) {
+                (true, None) => Some(widest_fov_deg(&scene.read_cameras(path)?)),
+                (true, known) => known,
+                (false, _) => None,
+            };
             Ok((key.clone(), CachedScene { num_frames: scene.images.len(), fov_deg, unusable: scene.unusable.clone() }))
         };
         Ok(Self { stamp, scenes: table()?.scenes.iter().map(scene).collect::<Result<_, DataError>>()? })

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use clift_core::{Camera, IntrinsicsNorm};
+use clift_core::{Camera, IntrinsicsNorm, widest_fov_deg};
 
 use crate::error::DataError;
 use crate::image::codec::check_encoded;
@@ -31,6 +31,8 @@ pub(crate) struct SceneTable {
     pub images: Vec<ByteSpan>,
     /// Frames of the file whose cameras cannot be used, in order, with the reasons.
     pub unusable: Vec<(usize, String)>,
+    /// Largest field of view of the usable frames, in degrees; `None` for unreadable cameras.
+    pub fov_deg: Option<f64>,
 }
 
 pub(crate) struct ChunkTable {
@@ -110,8 +112,8 @@ impl Builder<'_> {
         let (cameras, camera_type) =
             tensor("cameras", &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64])?;
         let timestamps = tensor("timestamps", &[Some(num_frames)], &[ElementType::I64]).ok().map(|(span, _)| span);
-        let (key, url, unusable) = (key.clone(), url.to_owned(), Vec::new());
-        let table = SceneTable { key, url, timestamps, cameras, camera_type, images, unusable };
+        let (key, url, unusable, fov_deg) = (key.clone(), url.to_owned(), Vec::new(), None);
+        let table = SceneTable { key, url, timestamps, cameras, camera_type, images, unusable, fov_deg };
         self.scenes.insert(table.key.clone(), table);
         Ok(())
     }
@@ -121,15 +123,19 @@ impl SceneTable {
     /// Leaves out the frames whose cameras cannot be used. An unreadable tensor of cameras is an error at its use.
     fn leave_out_unusable(&mut self, path: &Path) {
         let Ok(rows) = self.read_rows(path) else { return };
-        let reason = |row: &[f64; 18]| {
-            Camera::from_re10k(*row).err().map(|error| format!("whose camera cannot be used: {error}"))
-        };
-        let reasons = rows.iter().enumerate().filter_map(|(frame, row)| Some((frame, reason(row)?)));
-        self.unusable = reasons.take(MAX_UNUSABLE + 1).collect();
-        if self.unusable.len() > MAX_UNUSABLE {
-            self.unusable.truncate(1);
-            self.images.clear();
+        let mut cameras = Vec::with_capacity(rows.len());
+        for (frame, row) in rows.into_iter().enumerate() {
+            match Camera::from_re10k(row) {
+                Ok(camera) => cameras.push(camera),
+                Err(error) => self.unusable.push((frame, format!("whose camera cannot be used: {error}"))),
+            }
+            if self.unusable.len() > MAX_UNUSABLE {
+                self.unusable.truncate(1);
+                self.images.clear();
+                return;
+            }
         }
+        self.fov_deg = Some(widest_fov_deg(&cameras));
         let images = std::mem::take(&mut self.images);
         self.images = self.usable(images);
     }
