@@ -103,10 +103,10 @@ impl Frame {
             for (length, count) in (1_u8..).zip(counts) {
                 for symbol in symbols.by_ref().take(usize::from(*count)) {
                     entries.resize(entries.len() + (1 << (16 - length)), (length, *symbol));
+                    if entries.len() > 1 << 16 {
+                        return Err(BAD_SEGMENT);
+                    }
                 }
-            }
-            if entries.len() > 1 << 16 {
-                return Err(BAD_SEGMENT);
             }
             entries.resize(1 << 16, (0, 0));
             let table =
@@ -313,5 +313,50 @@ impl Reader<'_> {
         let marker = next_marker(self.data, self.at).ok_or(ENDS_EARLY)?;
         let left_over = self.num_bits as usize / 8 + marker - self.at;
         if left_over > MAX_LEFT_OVER { Err(LEFT_OVER) } else { Ok(marker) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::codec::encode_jpeg;
+    use crate::testing::{fixture, ramp};
+
+    #[test]
+    fn damage_is_found_in_sequential_and_progressive_files() {
+        let file = |name: &str| std::fs::read(fixture(name)).unwrap();
+        for (name, jpeg) in [
+            ("sequential", encode_jpeg(&ramp(101, 67), 90).unwrap()),
+            ("progressive", file("reference/progressive.jpg")),
+            ("restarts", file("reference/restarts.jpg")),
+        ] {
+            assert_eq!(check_scans(&jpeg), Ok(()), "{name}");
+            let scan = jpeg.windows(2).position(|pair| pair == [0xff, 0xda]).unwrap() + 16;
+            let (mut num_found, mut num_tried) = (0, 0);
+            for at in (scan..jpeg.len() - 300).step_by(97) {
+                for value in [0, 0x5a] {
+                    let mut damaged = jpeg.clone();
+                    damaged[at..at + 200].fill(value);
+                    num_found += usize::from(check_scans(&damaged).is_err());
+                    num_tried += 1;
+                }
+            }
+            assert!(num_tried > 10 && num_found * 10 >= num_tried * 9, "{name}: {num_found} of {num_tried}");
+        }
+    }
+
+    #[test]
+    fn malformed_files_are_errors_or_pass() {
+        let jpeg = std::fs::read(fixture("reference/progressive.jpg")).unwrap();
+        for at in 0..jpeg.len() {
+            let _ = check_scans(&jpeg[..at]);
+            for value in [0, 0xff, jpeg[at] ^ 0x10] {
+                let mut changed = jpeg.clone();
+                changed[at] = value;
+                let _ = check_scans(&changed);
+            }
+        }
+        assert_eq!(check_scans(b"\xff\xd8\xff\xc4\0\x01"), Err(BAD_SEGMENT));
+        assert_eq!(check_scans(b"\xff\xd8\xff\xda\0\x08\x01\x07\0\0\x3f\0"), Err(BAD_SEGMENT), "no such component");
     }
 }
