@@ -12,7 +12,8 @@ pub enum CameraError {
     },
     /// The camera centres that define a scene's scale coincide.
     #[error(
-        "scene {key} has no baseline: {}; remove the scene or choose other frames",
+        "scene {key} has no baseline: {}; the method needs parallax, photos from different places: a camera that only turns on \
+         a tripod shows no depth",
         match num_views {
             1 => "it has one view, and at least two are needed".to_owned(),
             _ => format!(

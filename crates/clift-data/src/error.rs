@@ -18,6 +18,14 @@ pub enum DataError {
         /// File.
         path: PathBuf,
     },
+    /// A file is too large, or is a folder, a pipe or a device.
+    #[error("bad file: {what}: {path}", path = path.display())]
+    BadFile {
+        /// Problem.
+        what: String,
+        /// File.
+        path: PathBuf,
+    },
     /// A camera cannot be used, or the cameras of a scene have no normalised frame.
     #[error(transparent)]
     Camera(#[from] CameraError),
@@ -90,6 +98,14 @@ pub enum DataError {
     TruncatedImage {
         /// Bytes of the file.
         num_bytes: u64,
+        /// Image file.
+        path: PathBuf,
+    },
+    /// The data of an image ends early or is damaged in its middle.
+    #[error("bad scene: the image is damaged: {what}: {path}", path = path.display())]
+    DamagedImage {
+        /// Problem.
+        what: &'static str,
         /// Image file.
         path: PathBuf,
     },

@@ -36,7 +36,7 @@ mod torch;
 pub use config::DataConfig;
 pub use dataset::{half_resolution_clips, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
-pub use scene_source::{SceneSource, Split};
+pub use scene_source::{SceneSource, Split, is_held_out};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
 
 // Layouts on disk, and synthetic scenes.
@@ -49,7 +49,8 @@ pub use sources::kind::SourceKind;
 pub use sources::open::{OpenedSource, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
 pub use sources::photos::image_cache::ImageCacheConfig;
-pub use sources::subset::{SceneSubset, is_held_out};
+pub use sources::photos::photo::PosesFrom;
+pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
 pub use synthetic::config::{Look, SyntheticConfig};
 pub use synthetic::source::SyntheticSource;

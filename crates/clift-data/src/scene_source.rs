@@ -6,6 +6,12 @@ use strum::Display;
 
 use crate::error::DataError;
 
+/// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
+/// With 0 no frame is.
+pub fn is_held_out(frame: usize, every: usize) -> bool {
+    every > 0 && frame.is_multiple_of(every)
+}
+
 /// One of the two splits of a data set. Prints as `train` or `test`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display)]
 #[serde(rename_all = "snake_case")]
@@ -47,6 +53,13 @@ pub trait SceneSource: Send + Sync {
     /// Returns the file name of every frame; empty for frames without files of their own.
     fn frame_names(&self, _scene: usize) -> Result<Vec<String>, DataError> {
         Ok(Vec::new())
+    }
+
+    /// Returns the frames of a scene that are held out of training, in order. The default returns every `every`-th frame
+    /// ([`is_held_out`]); captures that list the frames of their splits return the listed ones. With 0 no frame is held out.
+    fn held_out(&self, scene: usize, every: usize) -> Result<Vec<usize>, DataError> {
+        let num_frames = if every == 0 { 0 } else { self.num_frames(scene)? };
+        Ok((0..num_frames).filter(|frame| is_held_out(*frame, every)).collect())
     }
 
     /// Returns columns and rows of a frame. The default decodes the frame.

@@ -34,7 +34,7 @@ pub use report::training::TrainingCurve;
 // One scene with every method and token count.
 pub use sweep::eval_models::EvalModels;
 pub use sweep::evaluate_scene::evaluate_scene;
-pub use sweep::predictions::{ExternalMethod, file_name};
+pub use sweep::predictions::{ExternalMethod, distinct_file_name, file_name};
 pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;
 

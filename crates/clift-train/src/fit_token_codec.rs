@@ -38,11 +38,11 @@ pub fn fit_token_codec(
         return Err(bad("clusters.grouping", format!("\"{grouping}\""), fix));
     }
     let source = &reader.source;
-    let longest = (0..source.num_scenes()).filter_map(|scene| source.num_frames(scene).ok()).max();
+    let num_training =
+        |scene| Some(source.num_frames(scene).ok()? - source.held_out(scene, frames.hold_out).ok()?.len());
+    let longest = (0..source.num_scenes()).filter_map(num_training).max();
     // A capture of few photos has fewer targets.
-    let longest = longest.unwrap_or_default();
-    let num_held_out = if frames.hold_out > 0 { longest.div_ceil(frames.hold_out) } else { 0 };
-    let most_targets = longest.saturating_sub(num_held_out + config.eval.num_context);
+    let most_targets = longest.unwrap_or_default().saturating_sub(config.eval.num_context);
     let num_targets = config.eval.num_targets.min(most_targets.max(1));
     let eval = EvalConfig { index: None, num_scenes: 0, num_targets, ..config.eval.clone() };
     let (items, ..) = evaluation_items(&eval, reader, frames)?;

@@ -9,7 +9,7 @@ use crate::error::DataError;
 
 /// Reads a file of at most `limit` bytes. Folders, pipes and devices are refused before they are opened.
 pub(crate) fn read_bounded(path: &Path, limit: u64, action: &'static str) -> Result<Vec<u8>, DataError> {
-    let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
+    let bad = |what: String| DataError::BadFile { what, path: path.to_owned() };
     let metadata = std::fs::metadata(path).map_err(DataError::io(action, path))?;
     if !metadata.is_file() {
         return Err(bad("expected a regular file".into()));

@@ -1,18 +1,30 @@
 //! File names of a folder, and their natural order.
 
+use std::borrow::Cow;
 use std::cmp::Ordering;
+use std::ffi::OsString;
 use std::path::Path;
+
+use unicode_normalization::{UnicodeNormalization, is_nfc};
 
 use crate::error::DataError;
 
 const MAX_ENTRIES: usize = 1_000_000;
 
-/// Returns the names of the entries of a folder, sorted, without names that are not UTF-8.
+/// Returns the names of the entries of a folder, sorted. Names that begin with a dot are hidden files, such as the
+/// `._0.png` that macOS writes beside every copied `0.png`; they and names that are not UTF-8 are left out.
 pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
+    Ok(raw_file_names(folder)?.into_iter().filter_map(|name| name.into_string().ok()).collect())
+}
+
+/// Returns the names of the entries of a folder as [`file_names`], with names that are not UTF-8.
+pub(crate) fn raw_file_names(folder: &Path) -> Result<Vec<OsString>, DataError> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(DataError::io("listing the folder", folder))? {
         let name = entry.map_err(DataError::io("listing the folder", folder))?.file_name();
-        names.extend(name.into_string());
+        if !name.as_encoded_bytes().starts_with(b".") {
+            names.push(name);
+        }
         if names.len() > MAX_ENTRIES {
             let what = format!("the folder has more than {MAX_ENTRIES} entries");
             return Err(DataError::UnknownLayout { what, path: folder.to_owned() });
@@ -20,6 +32,16 @@ pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
     }
     names.sort_unstable();
     Ok(names)
+}
+
+/// Decodes a name as UTF-8, or else as Latin-1.
+pub(crate) fn decode_name(bytes: &[u8]) -> String {
+    str::from_utf8(bytes).map_or_else(|_| bytes.iter().copied().map(char::from).collect(), str::to_owned)
+}
+
+/// Returns a name with composed characters: macOS writes an umlaut as a letter and a mark, other systems as one character.
+pub(crate) fn composed(name: &str) -> Cow<'_, str> {
+    if is_nfc(name) { Cow::Borrowed(name) } else { Cow::Owned(name.nfc().collect()) }
 }
 
 /// Returns whether a name has the extension `ending`, case-sensitive.

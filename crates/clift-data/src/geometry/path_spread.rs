@@ -1,6 +1,10 @@
 //! Context views spread over a camera path.
 
-use clift_core::Pose;
+use clift_core::{DVec3, Pose};
+
+const MAX_STEPS: f64 = 20.0;
+/// Largest number of cameras that are compared with all others.
+const MAX_FAR: usize = 1000;
 
 /// Selects `num_views` frames from the first to the last at even distances along the path of the camera centres.
 ///
@@ -32,10 +36,32 @@ pub fn contexts_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>>
     Some(frames)
 }
 
+/// Returns the cameras that are farther from all others than [`MAX_STEPS`] median steps between successive cameras: wrong
+/// poses of a reconstruction, which would set the scale of the scene.
+pub(crate) fn far_cameras(centres: &[DVec3]) -> Vec<usize> {
+    let mut steps: Vec<f64> = centres.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
+    let reach = |frame: usize| {
+        let step = |at: Option<usize>| at.and_then(|at| steps.get(at)).copied().unwrap_or(f64::INFINITY);
+        step(frame.checked_sub(1)).min(step(Some(frame)))
+    };
+    let reaches: Vec<f64> = (0..centres.len()).map(reach).collect();
+    steps.sort_unstable_by(f64::total_cmp);
+    let Some(&median) = steps.get(steps.len().saturating_sub(1) / 2).filter(|median| **median > 0.0) else {
+        return Vec::new();
+    };
+    let is_far = |distance: f64| distance > MAX_STEPS * median;
+    let is_alone = |frame: usize| {
+        let mut others = centres.iter().enumerate().filter(|(other, _)| *other != frame);
+        others.all(|(_, centre)| is_far(centre.distance(centres[frame])))
+    };
+    let mut far: Vec<usize> = (0..centres.len()).filter(|frame| is_far(reaches[*frame])).take(MAX_FAR).collect();
+    far.retain(|frame| is_alone(*frame));
+    far
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DVec3;
     use proptest::prelude::*;
 
     fn at(places: &[f64]) -> Vec<Pose> {

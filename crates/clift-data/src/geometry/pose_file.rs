@@ -8,9 +8,11 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use crate::error::DataError;
-use crate::files::bounded::parse_json;
+use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::natural_order;
 
+/// Largest size of a file, in bytes.
+const MAX_BYTES: u64 = 128 << 20;
 const MAX_POSES: usize = 100_000;
 /// Accepted focal lengths over width and height; the upper bound also limits the principal point's distance from 0.
 const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
@@ -70,7 +72,7 @@ pub fn read_poses(
     width: usize,
     height: usize,
 ) -> Result<Vec<Camera>, DataError> {
-    let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
+    let text = read_bounded(path, MAX_BYTES, "reading the poses")?;
     let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
     let wrong_form = |error: serde_json::Error| {
         bad(format!("expected a transforms.json or {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))

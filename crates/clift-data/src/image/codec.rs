@@ -113,6 +113,9 @@ pub(crate) fn exif_orientation(bytes: &[u8]) -> Orientation {
 
 /// Turns or mirrors an image by its EXIF orientation.
 pub(crate) fn apply_orientation(image: RgbImage, orientation: Orientation) -> RgbImage {
+    if orientation == Orientation::NoTransforms {
+        return image;
+    }
     let RgbImage { width, height, rgb } = image;
     // A decoded image has three values per pixel, so that none is lost here.
     let pixels = image::RgbImage::from_raw(width as u32, height as u32, rgb).unwrap_or_default();

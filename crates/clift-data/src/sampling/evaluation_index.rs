@@ -8,10 +8,13 @@ use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, Visitor};
 
 use crate::error::DataError;
-use crate::files::bounded::parse_json;
+use crate::files::bounded::{parse_json, read_bounded};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkipReport;
+
+/// Largest size of an index, in bytes.
+const MAX_BYTES: u64 = 1 << 30;
 
 /// An evaluation index in the published form `{key: {"context": [..], "target": [..]} | null | {}}`, in file order.
 #[derive(Clone, Debug)]
@@ -37,7 +40,7 @@ impl EvaluationIndex {
     /// [`DataError::Io`], and [`DataError::BadIndex`] for another form, a repeated key, and an entry with only contexts
     /// or only targets.
     pub fn read(path: &Path) -> Result<Self, DataError> {
-        let text = std::fs::read(path).map_err(DataError::io("reading the evaluation index", path))?;
+        let text = read_bounded(path, MAX_BYTES, "reading the evaluation index")?;
         let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
         let file: IndexFile = parse_json(&text).map_err(|error| {
             bad(format!("expected {{key: {{\"context\": [..], \"target\": [..]}} or null}}, got {error}"))

@@ -6,6 +6,7 @@ use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
 use crate::scene_source::Split;
 use crate::skip_report::{SkipReport, first_few, plural};
+use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
 use crate::sources::photos::image_folder::num_images;
 use crate::sources::photos::re10k_text::looks_like_re10k;
@@ -97,7 +98,7 @@ impl<'a> SplitFolder<'a> {
                 return Ok(DetectedSource::Photos(SourceKind::Re10kTxt, Vec::new(), SkipReport::default()));
             }
         }
-        let FoundScenes { mut scenes, others, notes } = find_scenes(base)?;
+        let FoundScenes { mut scenes, others, notes, without_cameras } = find_scenes(base)?;
         let kind = if asked == SourceKind::Auto { self.recognise(&scenes)? } else { asked };
         let mut report = SkipReport { notes, ..SkipReport::default() };
         scenes.retain(|scene| {
@@ -123,6 +124,11 @@ impl<'a> SplitFolder<'a> {
                 _ => "expected folders with a transforms.json or a COLMAP model",
             };
             return Err(self.no_scenes(what, &others));
+        }
+        report.num_scenes += without_cameras.len();
+        for key in without_cameras {
+            let lacks = if is_dl3dv_key(&key) { "transforms.json" } else { "cameras" };
+            report.skip(key, format!("without {lacks}"));
         }
         if !others.is_empty() {
             report.notes.push(format!("not opened, other data sets: {}", first_few(&others)));

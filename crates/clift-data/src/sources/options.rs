@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::photos::image_cache::ImageCacheConfig;
+use crate::sources::photos::photo::PosesFrom;
 
 /// Paths of the parts of a layout, where they differ from the default.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -20,6 +21,9 @@ pub struct FileOptions {
     pub image_folder: Option<String>,
     /// Whether images are undistorted; by default only in `captures`.
     pub undistort: Option<bool>,
+    /// Pixels from which the poses were computed, for photos with an EXIF orientation whose cameras fit both: `stored`, as by
+    /// COLMAP, or `turned` by the orientation.
+    pub poses_from: PosesFrom,
     /// Whether scenes of `re10k_txt` and `dl3dv` with missing images are used without these frames. Frame indices then
     /// differ from those of published evaluation indices.
     pub keep_incomplete: bool,

@@ -8,12 +8,6 @@ use clift_core::{Camera, IntrinsicsNorm, RgbImage};
 use crate::error::DataError;
 use crate::scene_source::SceneSource;
 
-/// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
-/// With 0 no frame is.
-pub fn is_held_out(frame: usize, every: usize) -> bool {
-    every > 0 && frame.is_multiple_of(every)
-}
-
 /// Some scenes of a source in the given order, with all frames or those of training.
 pub struct SceneSubset {
     source: Arc<dyn SceneSource>,
@@ -21,7 +15,7 @@ pub struct SceneSubset {
     scenes: Vec<usize>,
     /// Indices in this subset by those in `source`.
     positions: HashMap<usize, usize>,
-    /// Every how many frames one is left out ([`is_held_out`]), 0 or at least 2; the other frames are renumbered.
+    /// The frames of [`SceneSource::held_out`] of this number are left out; the other frames are renumbered.
     hold_out: usize,
 }
 
@@ -43,14 +37,31 @@ impl SceneSubset {
         Self { hold_out, ..Self::first(source, usize::MAX) }
     }
 
-    /// Returns the number of a kept frame in the source.
-    fn frame_in_source(&self, frame: usize) -> usize {
-        if self.hold_out == 0 { frame } else { frame + 1 + frame / (self.hold_out - 1) }
+    /// Returns the frames in the source of a scene of this subset.
+    fn kept_frames(&self, scene: usize) -> Result<Vec<usize>, DataError> {
+        let scene = self.scenes[scene];
+        let held_out = self.source.held_out(scene, self.hold_out)?;
+        Ok((0..self.source.num_frames(scene)?).filter(|frame| held_out.binary_search(frame).is_err()).collect())
     }
 
-    fn kept<T>(&self, values: Vec<T>) -> Vec<T> {
-        let kept = values.into_iter().enumerate().filter(|(frame, _)| !is_held_out(*frame, self.hold_out));
-        kept.map(|(_, value)| value).collect()
+    /// Returns the number of a kept frame in the source.
+    fn frame_in_source(&self, scene: usize, frame: usize) -> Result<usize, DataError> {
+        if self.hold_out == 0 {
+            return Ok(frame);
+        }
+        let kept = self.kept_frames(scene)?;
+        let (key, num_frames) = (self.key(scene), kept.len());
+        kept.get(frame).copied().ok_or_else(|| DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames })
+    }
+
+    /// Keeps the values of the kept frames, of values for the frames in the source.
+    fn kept<T>(&self, scene: usize, values: Vec<T>) -> Result<Vec<T>, DataError> {
+        if self.hold_out == 0 {
+            return Ok(values);
+        }
+        let held_out = self.source.held_out(self.scenes[scene], self.hold_out)?;
+        let kept = values.into_iter().enumerate().filter(|(frame, _)| held_out.binary_search(frame).is_err());
+        Ok(kept.map(|(_, value)| value).collect())
     }
 }
 
@@ -68,16 +79,16 @@ impl SceneSource for SceneSubset {
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        let num_frames = self.source.num_frames(self.scenes[scene])?;
-        Ok(if self.hold_out == 0 { num_frames } else { num_frames - num_frames.div_ceil(self.hold_out) })
+        let scene = self.scenes[scene];
+        Ok(self.source.num_frames(scene)? - self.source.held_out(scene, self.hold_out)?.len())
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
-        Ok(self.kept(self.source.cameras(self.scenes[scene])?))
+        self.kept(scene, self.source.cameras(self.scenes[scene])?)
     }
 
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        Ok(self.kept(self.source.timestamps(self.scenes[scene])?))
+        self.kept(scene, self.source.timestamps(self.scenes[scene])?)
     }
 
     fn url(&self, scene: usize) -> Result<String, DataError> {
@@ -85,25 +96,30 @@ impl SceneSource for SceneSubset {
     }
 
     fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
-        Ok(self.kept(self.source.frame_names(self.scenes[scene])?))
+        self.kept(scene, self.source.frame_names(self.scenes[scene])?)
+    }
+
+    fn held_out(&self, scene: usize, every: usize) -> Result<Vec<usize>, DataError> {
+        if self.hold_out == 0 { self.source.held_out(self.scenes[scene], every) } else { Ok(Vec::new()) }
     }
 
     fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
-        self.source.image_size(self.scenes[scene], self.frame_in_source(frame))
+        self.source.image_size(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        self.source.frame(self.scenes[scene], self.frame_in_source(frame))
+        self.source.frame(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
-        self.source.encoded_frame(self.scenes[scene], self.frame_in_source(frame))
+        self.source.encoded_frame(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene_source::is_held_out;
     use crate::testing::rooms;
 
     #[test]
@@ -116,7 +132,7 @@ mod tests {
             let cameras = whole.cameras(0).unwrap();
             assert_eq!(training.cameras(0).unwrap(), expected.iter().map(|&i| cameras[i]).collect::<Vec<_>>());
             for (frame, &in_source) in expected.iter().enumerate() {
-                assert_eq!(training.frame_in_source(frame), in_source);
+                assert_eq!(training.frame_in_source(0, frame).unwrap(), in_source);
                 assert_eq!(training.frame(0, frame).unwrap(), whole.frame(0, in_source).unwrap());
             }
         }

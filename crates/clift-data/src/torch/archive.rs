@@ -8,7 +8,7 @@ use std::path::Path;
 use zip::{CompressionMethod, ZipArchive};
 
 use crate::error::DataError;
-use crate::torch::file_kind::other_format;
+use crate::torch::file_kind::{other_format, require_file};
 use crate::torch::values::MAX_BYTES;
 
 /// Byte range of a member of an archive, or of a part of a member. It takes 24 bytes, because a data set has millions.
@@ -62,7 +62,8 @@ impl ByteSpan {
         // Bounded by the size of the file: `Archive::open` checks the length.
         let mut bytes = vec![0; self.length as usize];
         file.read_exact(&mut bytes).map_err(|_| bad("lies behind the end of the file"))?;
-        if self.is_whole && crc32fast::hash(&bytes) != self.crc32 {
+        // 0 is written where checksums are switched off.
+        if self.is_whole && self.crc32 != 0 && crc32fast::hash(&bytes) != self.crc32 {
             return Err(bad("has another checksum than the directory of the archive"));
         }
         Ok(bytes)
@@ -77,6 +78,7 @@ impl Archive {
     /// Reads the directory. Member names are stored without the top folder: `data.pkl`, `data/0`.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
+        require_file(path)?;
         let file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
         let file_bytes = file.metadata().map_err(DataError::io("opening the chunk", path))?.len();
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| {
@@ -121,6 +123,11 @@ impl Archive {
             return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
         }
         member.read(path)
+    }
+
+    /// Returns whether the file was written without checksums, as after `torch.serialization.set_crc32_options(False)`.
+    pub fn lacks_checksums(&self) -> bool {
+        self.members.values().all(|member| member.crc32 == 0)
     }
 
     /// Returns a member by its name without the top folder.

@@ -7,8 +7,10 @@ use crate::files::bounded::read_start;
 
 /// Number of bytes read for the recognition.
 const NUM_BYTES: u64 = 512;
-/// Start of the files of `torch.save` before `PyTorch` 1.6: a magic number as a pickle of protocol 2.
-const LEGACY: &[u8] = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
+/// Magic number at the start of the files of `torch.save` before `PyTorch` 1.6, in a pickle of any protocol.
+const LEGACY: &[u8] = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
+/// Largest number of bytes of a pickle before the magic number.
+const MAX_LEGACY_START: usize = 16;
 
 /// Refuses folders, pipes and devices.
 pub(crate) fn require_file(path: &Path) -> Result<(), DataError> {
@@ -39,7 +41,8 @@ fn other_kind(start: &[u8], num_bytes: u64) -> Option<&'static str> {
     if start.is_empty() {
         return Some("an empty file; download it again");
     }
-    if start.starts_with(LEGACY) {
+    let first = &start[..start.len().min(MAX_LEGACY_START + LEGACY.len())];
+    if first.starts_with(b"\x80") && first.windows(LEGACY.len()).any(|part| part == LEGACY) {
         return Some(
             "written by torch.save in the format from before PyTorch 1.6; convert it in Python: \
              torch.save(torch.load(\"OLD\", map_location=\"cpu\"), \"NEW\") (weights_only=False executes code of the file: \
@@ -77,7 +80,8 @@ mod tests {
         let safetensors = [&9_u64.to_le_bytes()[..], b"{\"a\": {}}"].concat();
         for (bytes, what) in [
             (&b""[..], "an empty file"),
-            (&[LEGACY, b"\x80\x02M\xe9\x03."].concat(), "before PyTorch 1.6"),
+            (&[b"\x80\x02", LEGACY, b"\x80\x02M\xe9\x03."].concat(), "before PyTorch 1.6"),
+            (&[b"\x80\x04\x95\x0d\0\0\0\0\0\0\0", LEGACY].concat(), "before PyTorch 1.6"),
             (b"\x80\x04\x95\x00", "a plain pickle"),
             (&safetensors, "a safetensors file"),
             (b"\n<!DOCTYPE html><html>", "a web page"),

@@ -60,6 +60,12 @@ impl PickleWriter {
         self.bytes.extend_from_slice(bytes);
     }
 
+    /// Returns the pickle so far.
+    #[cfg(test)]
+    pub fn pickle(&self) -> &[u8] {
+        &self.bytes
+    }
+
     /// Returns the archive of pickle and storages, uncompressed, aligned to 64 bytes, with the top folder `prefix`.
     pub fn pack(self, prefix: &str) -> ZipResult<Vec<u8>> {
         let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);

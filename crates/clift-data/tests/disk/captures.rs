@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_core::{IntrinsicsNorm, RgbImage};
-use clift_data::{FileOptions, Lens, OpenedSource, SceneSource, Undistortion, decode_image, encode_png};
+use clift_data::{
+    FileOptions, Lens, OpenedSource, SceneSource, SourceOptions, Split, Undistortion, decode_image, encode_png,
+};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -108,7 +110,7 @@ fn colmap_images_are_found_from_any_model_folder() {
     let scene = root.path().join("attic");
     copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));
     let report = open_test(root.path()).unwrap().report;
-    assert!(report.notes[0].ends_with("sparse has 1 more model; only model 0 is used"), "{report}");
+    assert!(report.notes[0].ends_with("attic, sparse/0 with most images, 6, is used"), "{report}");
     let models: [(&str, PathBuf); 3] =
         [("colmap/sparse/0", "images".into()), ("dense/sparse", "dense/images".into()), ("sparse", "images_4".into())];
     for (model, images) in models {
@@ -117,5 +119,240 @@ fn colmap_images_are_found_from_any_model_folder() {
         copy_folder(&scene.join("images"), &other.path().join("attic").join(images));
         let source = open(other.path(), None);
         assert_eq!((source.key(0), source.frame(0, 0).unwrap()), ("attic", image.clone()), "{model}");
+    }
+}
+
+/// A PNG whose pixels have one gray value.
+fn gray(width: usize, height: usize, value: usize) -> Vec<u8> {
+    encode_png(&RgbImage { width, height, rgb: vec![value as u8; width * height * 3] }).unwrap()
+}
+
+/// Writes a COLMAP text model with images of 24 x 16 pixels, their names as bytes, at (0, 0, 0), (1, 0, 0), ..
+fn write_model(folder: &Path, names: &[Vec<u8>]) {
+    fs::create_dir_all(folder).unwrap();
+    fs::write(folder.join("cameras.txt"), "1 PINHOLE 24 16 20 20 12 8\n").unwrap();
+    let line = |(x, name): (usize, &Vec<u8>)| [format!("{x} 1 0 0 0 -{x} 0 0 1 ").as_bytes(), name, b"\n\n"].concat();
+    fs::write(folder.join("images.txt"), names.iter().enumerate().map(line).collect::<Vec<_>>().concat()).unwrap();
+}
+
+#[test]
+fn the_largest_colmap_model_is_used() {
+    for (models, expected) in [
+        (vec![("sparse/0", 2), ("sparse/1", 8)], "sparse/1"),
+        (vec![("sparse/1", 8)], ""),
+        (vec![("sparse/0", 3), ("sparse/1", 2), ("sparse/12", 7)], "sparse/12"),
+        (vec![("sparse/0/models/0", 2), ("sparse/0/models/3", 5)], "sparse/0/models/3"),
+        (vec![("dense/0/sparse", 4)], ""),
+        (vec![("distorted/sparse/0", 4)], ""),
+        (vec![("sparse", 4), ("sparse/0", 4)], "sparse with most images"),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        fs::create_dir(root.path().join("images")).unwrap();
+        (0..8).for_each(|i| fs::write(root.path().join(format!("images/{i}.png")), gray(24, 16, i)).unwrap());
+        for (folder, count) in &models {
+            write_model(
+                &root.path().join(folder),
+                &(0..*count).map(|i| format!("{i}.png").into_bytes()).collect::<Vec<_>>(),
+            );
+        }
+        let OpenedSource { source, report, .. } =
+            open_test(root.path()).unwrap_or_else(|error| panic!("{models:?}: {error}"));
+        let most = models.iter().map(|(_, count)| *count).max().unwrap();
+        assert_eq!(source.num_frames(0).unwrap(), most, "{models:?}");
+        assert!(expected.is_empty() || report.notes[0].contains(expected), "{models:?}: {report}");
+    }
+}
+
+#[test]
+fn images_are_found_by_every_spelling_of_their_names() {
+    let (composed, decomposed) = ("k\u{fc}che", "ku\u{308}che");
+    for (file, named) in [
+        ("images/left/0.png", b"left\\0.png".to_vec()),
+        ("images/left/0.png", b"images/left/0.png".to_vec()),
+        ("images/left/0.png", b"/home/somebody/images/left/0.png".to_vec()),
+        ("images/left/0.png", b"images\\left\\0.png".to_vec()),
+        ("images/a b/0.png", b"a%20b/0.png".to_vec()),
+        ("images/100%20.png", b"100%20.png".to_vec()),
+        (&format!("images/{composed}.png"), b"k\xfcche.png".to_vec()),
+        (&format!("images/{composed}.png"), format!("{decomposed}.png").into_bytes()),
+        (&format!("images/{decomposed}.png"), format!("{composed}.png").into_bytes()),
+        (&format!("images/{decomposed}/0.png"), format!("{composed}/0.png").into_bytes()),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join(file);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, gray(24, 16, 9)).unwrap();
+        write_model(&root.path().join("sparse/0"), std::slice::from_ref(&named));
+        let shown = String::from_utf8_lossy(&named);
+        let opened = open_test(root.path()).unwrap_or_else(|error| panic!("{file} as {shown}: {error}"));
+        assert_eq!(opened.source.frame(0, 0).unwrap().rgb[0], 9, "{file} as {shown}");
+        let Ok(name) = String::from_utf8(named) else { continue };
+        fs::remove_dir_all(root.path().join("sparse")).unwrap();
+        let name = if name.contains("images") { name } else { format!("images/{name}") };
+        write_capture(root.path(), &[], &json!({"fl_x": 20, "frames": [frame_at(0.0, &name)]}));
+        let opened = open_test(root.path()).unwrap_or_else(|error| panic!("{file} as {name}: {error}"));
+        assert_eq!(opened.source.frame(0, 0).unwrap().rgb[0], 9, "{file} as {name}");
+    }
+    #[cfg(target_os = "linux")]
+    {
+        use std::os::unix::ffi::OsStrExt;
+        let root = tempfile::tempdir().unwrap();
+        let name = b"k\xfcche.png";
+        fs::create_dir(root.path().join("images")).unwrap();
+        fs::write(root.path().join("images").join(std::ffi::OsStr::from_bytes(name)), gray(24, 16, 9)).unwrap();
+        write_model(&root.path().join("sparse/0"), &[name.to_vec()]);
+        assert_eq!(open_test(root.path()).unwrap().source.frame_names(0).unwrap(), ["k\u{fc}che.png"]);
+    }
+}
+
+#[test]
+fn names_are_relative_to_the_folder_of_all_images() {
+    for (files, expected) in [
+        (["images/front/0.png", "images/back/0.png"], ["back/0.png", "front/0.png"]),
+        (["images/0.png", "images/1.png"], ["0.png", "1.png"]),
+        (["0.png", "left/0.png"], ["0.png", "left/0.png"]),
+    ] {
+        let frames: Vec<Value> = files.iter().zip([0.0, 1.0]).map(|(name, x)| frame_at(x, name)).collect();
+        let (_root, opened) = capture(&files, &json!({"fl_x": 20, "frames": frames}));
+        assert_eq!(opened.source.frame_names(0).unwrap(), expected);
+    }
+}
+
+#[test]
+fn calibrations_of_larger_images_are_guessed_from_the_principal_point() {
+    for (given, width, note) in [
+        (json!({"fl_x": 80, "cx": 48, "cy": 32}), 96.0, true),
+        (json!({"fl_x": 80, "cx": 49.5, "cy": 31}), 96.0, true),
+        (json!({"fl_x": 20, "cx": 12, "cy": 8}), 24.0, false),
+        (json!({"fl_x": 20, "cx": 14, "cy": 8}), 24.0, false),
+        (json!({"fl_x": 80}), 24.0, false),
+        (json!({"fl_x": 80, "cx": 48, "cy": 32, "w": 24, "h": 16}), 24.0, false),
+    ] {
+        let mut transforms = given.clone();
+        transforms["frames"] = json!([frame_at(0.0, "0.png"), frame_at(1.0, "1.png")]);
+        let (_root, opened) = capture(&["0.png", "1.png"], &transforms);
+        let fx = opened.source.cameras(0).unwrap()[0].intrinsics.fx;
+        assert!((fx - given["fl_x"].as_f64().unwrap() / width).abs() < 1e-12, "{given}: {fx}");
+        let has_note =
+            opened.report.to_string().contains("the intrinsics are taken as those of images of 96x64; write w and h");
+        assert_eq!(has_note, note, "{given}: {}", opened.report);
+    }
+}
+
+#[test]
+fn listed_frames_are_held_out() {
+    let names = ["0.png", "1.png", "2.png", "3.png"];
+    for (lists, held_out) in [
+        (json!({"train_filenames": ["0.png", "3.png"], "test_filenames": ["1.png"]}), vec![1, 2]),
+        (json!({"test_filenames": ["2.png"], "val_filenames": ["3.png"]}), vec![2, 3]),
+        (json!({"test_filenames": []}), vec![0, 2]),
+        (json!({}), vec![0, 2]),
+    ] {
+        let mut transforms = lists.clone();
+        transforms["fl_x"] = 20.into();
+        transforms["frames"] = names.iter().zip([0.0, 1.0, 2.0, 3.0]).map(|(name, x)| frame_at(x, name)).collect();
+        let (_root, opened) = capture(&names, &transforms);
+        assert_eq!(opened.source.held_out(0, 2).unwrap(), held_out, "{lists}");
+        assert_eq!(opened.source.held_out(0, 0).unwrap(), [0; 0]);
+        let training = opened.training_source(2);
+        let kept: Vec<&str> = (0..4).filter(|frame| !held_out.contains(frame)).map(|frame| names[frame]).collect();
+        assert_eq!(training.frame_names(0).unwrap(), kept, "{lists}");
+        assert_eq!(training.cameras(0).unwrap()[1].c2w.translation[0], f64::from(kept[1].as_bytes()[0] - b'0'));
+    }
+}
+
+#[test]
+fn dl3dv_frames_come_from_the_first_folder_that_is_large_enough() {
+    for (folders, expected) in [
+        (vec![("images_8", 48), ("images_4", 96)], Some(96)),
+        (vec![("images_8", 96), ("images_4", 192)], Some(96)),
+        (vec![("images_8", 24), ("images_4", 48)], None),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        let (scene, empty) = (root.path().join("a".repeat(64)), root.path().join("b".repeat(64)));
+        fs::create_dir_all(empty.join("images_8")).unwrap();
+        let images: Vec<_> =
+            folders.iter().map(|(folder, width)| (format!("{folder}/0.png"), gray(*width, width * 2 / 3, 9))).collect();
+        let images: Vec<_> = images.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
+        write_capture(
+            &scene,
+            &images,
+            &json!({"fl_x": 300, "w": 384, "h": 256, "frames": [frame_at(0.0, "images/0.png")]}),
+        );
+        let options = SourceOptions { min_size: [80, 50], ..SourceOptions::default() };
+        let OpenedSource { source, report, .. } = crate::open(root.path(), Split::Test, &options).unwrap();
+        let width = (source.num_scenes() > 0).then(|| source.image_size(0, 0).unwrap()[0]);
+        assert_eq!(width, expected, "{folders:?}: {report}");
+        let reason = report.skips.iter().find(|skip| skip.key == "b".repeat(64)).map(|skip| skip.reason.as_str());
+        assert_eq!(reason, Some("without transforms.json"), "{report}");
+    }
+}
+
+#[test]
+fn frames_of_real_estate_10k_are_matched_within_half_a_frame_or_in_order() {
+    let camera = "0.9 1.6 0.5 0.5 0 0 1 0 0 0 0 1 0 0 0 0 1 0";
+    let times = [1_000_000, 1_033_367, 1_066_733, 1_100_100];
+    let all = |name: &dyn Fn(i64, usize) -> String| {
+        times.iter().enumerate().map(|(i, time)| name(*time, i)).collect::<Vec<_>>()
+    };
+    for (names, num_frames, note) in [
+        (all(&|time, _| format!("{time}.png")), 4, ""),
+        (all(&|time, i| format!("{}.png", if i == 2 { time + 100 } else { time })), 4, "1 image differ"),
+        (all(&|time, _| format!("{}.png", time - 16_000)), 4, "4 images differ"),
+        (all(&|_, i| format!("frame_{i:05}.png")), 4, "in the order of their names"),
+        (all(&|_, i| format!("{}.png", i + 9)), 4, "in the order of their names"),
+        (all(&|_, i| format!("frame_{i:05}.png"))[..3].to_vec(), 0, ""),
+        (all(&|time, _| format!("{time}.png"))[..3].to_vec(), 3, ""),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        fs::create_dir_all(root.path().join("frames/clip")).unwrap();
+        let lines = times.map(|time| format!("{time} {camera}\n")).concat();
+        fs::write(root.path().join("clip.txt"), format!("https://example.org/clip\n{lines}")).unwrap();
+        for (value, name) in names.iter().enumerate() {
+            fs::write(root.path().join("frames/clip").join(name), gray(24, 16, value)).unwrap();
+        }
+        let opened = open_with(root.path(), FileOptions { keep_incomplete: true, ..FileOptions::default() });
+        let OpenedSource { source, report, .. } = match opened {
+            Ok(opened) => opened,
+            Err(message) => {
+                assert_eq!(num_frames, 0, "{names:?}: {message}");
+                assert!(
+                    message.contains("name frames by time stamp") && message.contains("data.files.frames"),
+                    "{message}"
+                );
+                continue;
+            }
+        };
+        assert_eq!(source.num_frames(0).unwrap(), num_frames, "{names:?}: {report}");
+        assert!(
+            report.notes.join("; ").contains(note.split(' ').next_back().unwrap_or_default()),
+            "{names:?}: {report}"
+        );
+        let grays: Vec<usize> = (0..num_frames).map(|frame| source.frame(0, frame).unwrap().rgb[0].into()).collect();
+        assert_eq!(grays, (0..num_frames).collect::<Vec<_>>(), "{names:?}");
+        assert_eq!(source.timestamps(0).unwrap(), times[..num_frames]);
+    }
+}
+
+#[test]
+fn hidden_files_are_ignored() {
+    for (layout, file) in [
+        ("re10k_txt", "test/d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a.txt"),
+        ("scenes", "test/d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a.torch"),
+        ("capture", "attic/transforms.json"),
+        ("colmap_txt", "attic/images/left/frame 8.png"),
+    ] {
+        let root = copy_of_layout(layout);
+        let path = root.path().join(file);
+        // Files that macOS writes beside the copied ones.
+        for entry in fs::read_dir(path.parent().unwrap()).unwrap() {
+            let path = entry.unwrap().path();
+            let name = format!("._{}", path.file_name().unwrap().to_str().unwrap());
+            fs::write(path.with_file_name(name), b"\0\x05\x16\x07\0\x02\0\0Mac OS X").unwrap();
+        }
+        let opened = open_test(root.path()).unwrap_or_else(|error| panic!("{layout}: {error}"));
+        let expected = open_test(&crate::files::layout(layout)).unwrap();
+        assert_eq!(opened.source.num_frames(0).unwrap(), expected.source.num_frames(0).unwrap(), "{layout}");
+        assert_eq!(opened.report.skips, expected.report.skips, "{layout}");
     }
 }

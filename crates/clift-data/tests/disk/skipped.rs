@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use clift_core::RgbImage;
-use clift_data::{FileOptions, OpenedSource, decode_image, encode_jpeg, encode_png};
+use clift_core::{Camera, DMat3, IntrinsicsNorm, Pose, RgbImage};
+use clift_data::{FileOptions, OpenedSource, PosesFrom, encode_jpeg, encode_png};
 use serde_json::{Value, json};
 
 use crate::files::{copy_of_layout, frame_at, write_capture};
@@ -163,37 +163,150 @@ fn images_are_found_by_the_end_of_paths() {
 }
 
 #[test]
-fn exif_orientation_follows_the_aspect_ratio_of_the_camera() {
-    // Phones store sensor rows, with a tag for the rotation: 6 is a quarter turn clockwise.
-    let tagged = |frame: &RgbImage| {
-        let jpeg = encode_jpeg(frame, 90).unwrap();
-        let exif = b"\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
-        [&jpeg[..2], exif, &jpeg[2..]].concat()
+fn views_are_turned_upright_from_the_pixels_of_the_poses() {
+    // Phones store sensor rows, with a tag for the rotation: 6 is a quarter turn clockwise, 8 the other, 3 a half turn.
+    let tagged = |frame: &RgbImage, tag: u8| {
+        let png = encode_png(frame).unwrap();
+        let exif = [&b"eXIfII*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0"[..], &[tag], &[0; 7]].concat();
+        let sum = crc32fast::hash(&exif).to_be_bytes();
+        [&png[..33], &(exif.len() as u32 - 4).to_be_bytes(), &exif, &sum, &png[33..]].concat()
     };
-    let root = tempfile::tempdir().unwrap();
-    let (upright, lying) = (tagged(&image(48, 32)), tagged(&image(32, 48)));
-    let images = [("0.jpg", upright.clone()), ("1.jpg", lying.clone()), ("2.jpg", tagged(&image(40, 40)))];
-    write(root.path(), &images, &["0.jpg", "1.jpg", "2.jpg"]);
-    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
-    assert_eq!(skipped_frames(&report), [("2.jpg", "whose image has another aspect ratio than its camera")]);
-    let key = source.key(0);
-    let notes = [
-        format!("1 image turned by the EXIF orientation, as the size of the cameras requires: 1 of {key}"),
-        format!(
-            "1 image with an EXIF orientation that is not applied, as the cameras have the stored size: 1 of {key}"
-        ),
-    ];
-    assert_eq!(report.notes[..2], notes);
-    assert_eq!(source.frame(0, 0).unwrap(), decode_image(&upright, "0", 0).unwrap(), "as stored");
-    let (turned, stored) = (source.frame(0, 1).unwrap(), decode_image(&lying, "1", 0).unwrap());
-    assert_eq!((turned.width, turned.height, source.image_size(0, 1).unwrap()), (48, 32, [48, 32]));
-    let pixel =
-        |image: &RgbImage, column: usize, row: usize| image.rgb[3 * (row * image.width + column)..][..3].to_vec();
-    for (column, row) in [(0, 0), (47, 0), (0, 31), (20, 9)] {
-        assert_eq!(pixel(&turned, column, row), pixel(&stored, row, 47 - column), "{column} {row}");
+    let (wide, tall, square) = ([48, 32], [32, 48], [40, 40]);
+    // Stored size, tag, size of the camera, pixels of the poses: which are turned, the image alone or the view.
+    for (stored, tag, camera, poses_from, turned, note) in [
+        (wide, 6, Some(wide), PosesFrom::Stored, "view", "turned with their cameras"),
+        (wide, 6, Some(tall), PosesFrom::Stored, "image", "as the size of the cameras requires"),
+        (tall, 8, Some(tall), PosesFrom::Turned, "view", "turned with their cameras"),
+        (wide, 3, Some(wide), PosesFrom::Stored, "view", "data.files.poses_from"),
+        (wide, 3, Some(wide), PosesFrom::Turned, "image", "data.files.poses_from"),
+        (square, 6, Some(square), PosesFrom::Stored, "view", "data.files.poses_from"),
+        (square, 8, Some(square), PosesFrom::Turned, "image", "data.files.poses_from"),
+        (wide, 6, None, PosesFrom::Stored, "view", "data.files.poses_from"),
+        (wide, 6, None, PosesFrom::Turned, "image", "data.files.poses_from"),
+        (wide, 2, Some(wide), PosesFrom::Stored, "none", "not applied, as it mirrors"),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        let image = image(stored[0], stored[1]);
+        let mut json = json!({"fl_x": 40, "fl_y": 50, "frames": [frame_at(0.0, "0.png"), frame_at(1.0, "1.png")]});
+        for (key, side) in ["w", "h"].iter().zip(camera.into_iter().flatten()) {
+            json[*key] = side.into();
+        }
+        write_capture(root.path(), &[("0.png", tagged(&image, tag)), ("1.png", tagged(&image, tag))], &json);
+        let OpenedSource { source, report, .. } =
+            open_with(root.path(), FileOptions { poses_from, ..FileOptions::default() }).unwrap();
+        let case = format!("{stored:?} {tag} {camera:?} {poses_from:?}: {report}");
+        assert!(report.notes.iter().any(|got| got.starts_with("2 images") && got.contains(note)), "{case}");
+        let (got, [width, height]) = (source.frame(0, 0).unwrap(), stored);
+        assert_eq!(source.image_size(0, 0).unwrap(), [got.width, got.height], "{case}");
+        assert_eq!(source.encoded_frame(0, 0).unwrap().is_some(), turned == "none", "{case}");
+        // Where a stored pixel is in the turned image.
+        let place = |x: usize, y: usize| match tag {
+            3 => [width - 1 - x, height - 1 - y],
+            6 => [height - 1 - y, x],
+            8 => [y, width - 1 - x],
+            _ => [x, y],
+        };
+        let camera = source.cameras(0).unwrap()[0];
+        let direction = |camera: Camera<IntrinsicsNorm>, size: [usize; 2], [x, y]: [usize; 2]| {
+            let intrinsics = camera.intrinsics.to_pixels(size[0], size[1]);
+            Camera { c2w: camera.c2w, intrinsics }.direction(x as f64 + 0.5, y as f64 + 0.5)
+        };
+        // The pixels of the poses: focal lengths of 40 and 50 pixels, OpenGL axes.
+        let of_poses = if turned == "image" { [got.width, got.height] } else { stored };
+        let c2w = Pose { rotation: DMat3::from_diagonal([1.0, -1.0, -1.0].into()), ..Pose::IDENTITY };
+        let [w, h] = of_poses.map(|side| side as f64);
+        let given = Camera { c2w, intrinsics: IntrinsicsNorm { fx: 40.0 / w, fy: 50.0 / h, cx: 0.5, cy: 0.5 } };
+        for (x, y) in [(0, 0), (width - 1, 0), (0, height - 1), (20, 9)] {
+            let [column, row] = place(x, y);
+            let rgb = |image: &RgbImage, x: usize, y: usize| image.rgb[3 * (y * image.width + x)..][..3].to_vec();
+            assert_eq!(rgb(&got, column, row), rgb(&image, x, y), "{case}");
+            let expected = direction(given, of_poses, if turned == "image" { [column, row] } else { [x, y] });
+            let ray = direction(camera, [got.width, got.height], [column, row]);
+            assert!(ray.distance(expected) < 1e-12, "{case}: {ray} {expected}");
+        }
     }
-    assert_eq!(source.encoded_frame(0, 0).unwrap(), Some(upright));
-    assert_eq!(source.encoded_frame(0, 1).unwrap(), None, "a copy of the file would lie on its side");
+}
+
+#[test]
+fn one_bad_item_costs_one_frame() {
+    let jpeg = |quality| encode_jpeg(&image(96, 64), quality).unwrap();
+    let name = |frame: usize| format!("{frame}.jpg");
+    let damaged = |bytes: &[u8], at: usize, value: &dyn Fn(usize) -> u8| {
+        let mut bytes = bytes.to_vec();
+        (at..at + 600).for_each(|at| bytes[at] = value(at));
+        bytes
+    };
+    let camera = "whose camera cannot be used: ";
+    for (what, json, damage, expected) in [
+        ("fisheye", Some(("camera_model", json!("SPHERICAL"))), None, camera),
+        ("NaN focal length", Some(("fl_x", json!("NaN"))), None, camera),
+        ("-nan(ind)", Some(("cx", json!("-nan(ind)"))), None, camera),
+        (
+            "1.#QNAN matrix",
+            Some(("transform_matrix", json!([[1, 0, 0, "1.#QNAN"], [0, 1, 0, 0], [0, 0, 1, 0]]))),
+            None,
+            camera,
+        ),
+        (
+            "null in the matrix",
+            Some(("transform_matrix", json!([[1, 0, 0, null], [0, 1, 0, 0], [0, 0, 1, 0]]))),
+            None,
+            camera,
+        ),
+        ("no matrix", Some(("transform_matrix", json!(null))), None, camera),
+        ("zeros", None, Some(damaged(&jpeg(90), 2500, &|_| 0)), "whose image is damaged"),
+        ("noise", None, Some(damaged(&jpeg(90), 2500, &|at| (at * at / 7 % 251) as u8)), "whose image is damaged"),
+        (
+            "far",
+            Some(("transform_matrix", json!([[1, 0, 0, 1e5], [0, 1, 0, 0], [0, 0, 1, 0]]))),
+            None,
+            "whose camera is farther",
+        ),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        let mut images: Vec<_> = (0..6).map(|frame| (name(frame), jpeg(90))).collect();
+        images[3].1 = damage.unwrap_or_else(|| jpeg(90));
+        let images: Vec<_> = images.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
+        let mut frames: Vec<Value> = (0..6).map(|frame| frame_at(frame as f64, &name(frame))).collect();
+        if let Some((key, value)) = json {
+            frames[3][key] = value;
+        }
+        write_capture(root.path(), &images, &json!({"fl_x": 80, "cx": 48, "w": 96, "h": 64, "frames": frames}));
+        // Programs write these words without quotes.
+        let path = root.path().join("transforms.json");
+        let mut text = fs::read_to_string(&path).unwrap();
+        for word in ["NaN", "-nan(ind)", "1.#QNAN"] {
+            text = text.replace(&format!("\"{word}\""), word);
+        }
+        fs::write(&path, text).unwrap();
+        let OpenedSource { source, report, .. } =
+            open_test(root.path()).unwrap_or_else(|error| panic!("{what}: {error}"));
+        let [(frame, reason)] = skipped_frames(&report)[..] else { panic!("{what}: {report}") };
+        assert!(frame == "3.jpg" && reason.starts_with(expected), "{what}: {report}");
+        assert_eq!(source.frame_names(0).unwrap(), [0, 1, 2, 4, 5].map(name), "{what}");
+        assert!((0..5).all(|frame| source.frame(0, frame).is_ok()), "{what}");
+    }
+}
+
+#[test]
+fn one_bad_camera_of_a_colmap_model_costs_its_frame() {
+    for (file, from, to, num_skipped) in [
+        ("cameras.txt", "7 PINHOLE", "9 THIN_PRISM 1 1 1\n8 PINHOLE 10 10 -nan(ind) 1 5 5\n7 PINHOLE", 0),
+        ("images.txt", "40 0.9833474432563557", "40 -nan(ind)", 1),
+        ("images.txt", "\n3.5 0 -1", "\n-nan(ind) 1.#IND -1 3.5 nan(ind) -1 7 zero -1 -nan(ind) 2 5", 0),
+        ("images.txt", "\n3.5 0 -1", "\n3 1 4 7.5 nan -1 7 3 5 -nan(ind) 2 5", 0),
+    ] {
+        let root = copy_of_layout("colmap_txt");
+        let path = root.path().join("attic/sparse/0").join(file);
+        let text = fs::read_to_string(&path).unwrap();
+        assert!(text.contains(from), "{from}");
+        fs::write(&path, text.replacen(from, to, 1)).unwrap();
+        let OpenedSource { source, report, .. } =
+            open_test(root.path()).unwrap_or_else(|error| panic!("{to}: {error}"));
+        assert_eq!(source.num_frames(0).unwrap() + num_skipped, 6, "{to}: {report}");
+        assert_eq!(skipped_frames(&report).len(), num_skipped, "{to}: {report}");
+        assert!(skipped_frames(&report).iter().all(|(_, reason)| reason.contains("the pose holds NaN")), "{report}");
+    }
 }
 
 #[test]

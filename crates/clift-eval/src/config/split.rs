@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use clift_data::{OpenedSource, Split, ViewIndices, even_views, even_views_of, is_held_out};
+use clift_data::{DataError, EvaluationItem, OpenedSource, SceneSource, Split, ViewIndices, even_views, even_views_of};
 use serde::{Deserialize, Serialize};
 
 /// What the figures of an evaluation were measured on.
@@ -65,35 +65,51 @@ impl EvalFrames {
     }
 
     /// Spreads the views of a scene without an index: held-out frames are targets only, and no views of training frames.
-    pub(crate) fn views(&self, num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
+    pub(crate) fn views(
+        &self,
+        source: &dyn SceneSource,
+        scene: usize,
+        num_context: usize,
+        num_targets: usize,
+    ) -> Result<Option<ViewIndices>, DataError> {
+        let num_frames = source.num_frames(scene)?;
         if self.hold_out == 0 {
-            return even_views(num_frames, num_context, num_targets);
+            return Ok(even_views(num_frames, num_context, num_targets));
         }
-        let is_target = |frame: &usize| is_held_out(*frame, self.hold_out);
-        let (held_out, rest): (Vec<usize>, Vec<usize>) = (0..num_frames).partition(is_target);
+        let held_out = source.held_out(scene, self.hold_out)?;
+        let rest: Vec<usize> = (0..num_frames).filter(|frame| held_out.binary_search(frame).is_err()).collect();
         let targets = (self.split == EvalSplit::HeldOutFrames).then_some(&held_out[..]);
-        even_views_of(&rest, targets, num_context, num_targets)
+        Ok(even_views_of(&rest, targets, num_context, num_targets))
     }
 
     /// Returns the split of the views of an index: frames that training reads are not held-out frames.
-    pub(crate) fn of_views<'a>(&self, mut views: impl Iterator<Item = &'a ViewIndices>) -> EvalSplit {
-        let is_held_out = |views: &ViewIndices| views.target.iter().all(|frame| is_held_out(*frame, self.hold_out));
-        if self.split == EvalSplit::HeldOutFrames && !views.all(is_held_out) { EvalSplit::Train } else { self.split }
+    pub(crate) fn of_views(&self, source: &dyn SceneSource, items: &[EvaluationItem]) -> EvalSplit {
+        let is_held_out = |item: &EvaluationItem| {
+            let held_out = source.held_out(item.scene, self.hold_out).unwrap_or_default();
+            item.views.target.iter().all(|frame| held_out.binary_search(frame).is_ok())
+        };
+        let is_measured = self.split != EvalSplit::HeldOutFrames || items.iter().all(is_held_out);
+        if is_measured { self.split } else { EvalSplit::Train }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use clift_data::{SyntheticConfig, SyntheticSource};
+
     use super::*;
 
     #[test]
     fn held_out_frames_are_targets_and_no_contexts() {
-        let views = |split| EvalFrames { split, hold_out: 8 }.views(50, 4, 3).unwrap();
+        let rooms =
+            |num_frames| SyntheticSource::new(SyntheticConfig { num_frames, ..SyntheticConfig::default() }).unwrap();
+        let views = |split| EvalFrames { split, hold_out: 8 }.views(&rooms(50), 0, 4, 3).unwrap().unwrap();
         let held_out = views(EvalSplit::HeldOutFrames);
         assert!(held_out.target.iter().all(|frame| frame % 8 == 0) && held_out.target.len() == 3);
         let train = views(EvalSplit::Train);
         assert!(held_out.context.iter().chain(&train.context).chain(&train.target).all(|frame| frame % 8 != 0));
-        let few = EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 8 }.views(10, 4, 3).unwrap();
+        let few =
+            EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 8 }.views(&rooms(10), 0, 4, 3).unwrap().unwrap();
         assert_eq!(few.target, [0, 8], "as many as there are");
     }
 
@@ -101,7 +117,9 @@ mod tests {
     fn index_with_a_training_frame_measures_training_scenes() {
         let held_out = EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 4 };
         let of = |frames: EvalFrames, target: &[usize]| {
-            frames.of_views([ViewIndices { context: vec![1, 2], target: target.to_vec() }].iter())
+            let views = ViewIndices { context: vec![1, 2], target: target.to_vec() };
+            let source = SyntheticSource::new(SyntheticConfig::default()).unwrap();
+            frames.of_views(&source, &[EvaluationItem { scene: 0, views }])
         };
         assert_eq!(of(held_out, &[0, 4]), EvalSplit::HeldOutFrames);
         assert_eq!(of(held_out, &[0, 5]), EvalSplit::Train);

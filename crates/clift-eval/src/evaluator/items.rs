@@ -30,7 +30,7 @@ pub fn evaluation_items(
         let mut skip_report = SkipReport::new(count);
         let mut items = Vec::with_capacity(count);
         for scene in 0..count {
-            match source.num_frames(scene).map(|count| frames.views(count, eval.num_context, eval.num_targets)) {
+            match frames.views(source.as_ref(), scene, eval.num_context, eval.num_targets) {
                 Ok(Some(views)) => items.push(EvaluationItem { scene, views }),
                 Ok(None) => {
                     skip_report.skip(source.key(scene), "too few frames for eval.num_context and eval.num_targets");
@@ -43,6 +43,6 @@ pub fn evaluation_items(
     if items.is_empty() {
         return Err(EvalError::NoScenes { reason: format!("evaluation: {skip_report}") });
     }
-    let split = frames.of_views(items.iter().map(|item| &item.views));
+    let split = frames.of_views(source.as_ref(), &items);
     Ok((items, skip_report, split))
 }

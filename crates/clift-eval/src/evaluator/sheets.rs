@@ -9,7 +9,7 @@ use clift_core::StagedDir;
 
 use crate::error::EvalError;
 use crate::figures::canvas::Canvas;
-use crate::sweep::predictions::file_name;
+use crate::sweep::predictions::distinct_file_name;
 
 /// The contact sheets of an evaluation, which replace the sheets of an earlier evaluation in the same folder.
 pub(crate) struct Sheets {
@@ -50,5 +50,5 @@ impl Sheets {
 }
 
 fn sheet_name(key: &str) -> String {
-    format!("{}.png", file_name(key))
+    format!("{}.png", distinct_file_name(key))
 }

@@ -80,6 +80,14 @@ pub fn file_name(key: &str) -> String {
     if name.len() <= MAX_KEY_CHARS { name } else { format!("{}-{:016x}", &name[..MAX_KEY_CHARS], derive_seed(0, key)) }
 }
 
+/// Returns a scene key as a file name of its own: [`file_name`], with a hash of the key if that is another text, so that the
+/// files of `a/b` and `a_b` differ.
+pub fn distinct_file_name(key: &str) -> String {
+    let name = file_name(key);
+    let has_hash = name.len() > MAX_KEY_CHARS;
+    if name == key || has_hash { name } else { format!("{name}-{:08x}", derive_seed(0, key) as u32) }
+}
+
 /// Reads an opaque PNG of 8 or 16 bits as `[height, width, 3]` in `[0, 1]`.
 fn read_image(path: &Path, height: usize, width: usize) -> Result<Vec<f32>, EvalError> {
     let bad = |reason: String| EvalError::BadPrediction { reason, path: path.into() };
@@ -157,5 +165,7 @@ mod tests {
         let [a, b] = ["a", "b"].map(|end| file_name(&format!("{}{end}", "room".repeat(1250))));
         assert!(a.len() < 200 && b.len() == a.len() && a != b, "{a} {b}");
         assert_eq!(file_name(&"x".repeat(120)), "x".repeat(120));
+        let names = ["a/b", "a_b", "a?b"].map(distinct_file_name);
+        assert!(names[1] == "a_b" && names.iter().collect::<std::collections::BTreeSet<_>>().len() == 3, "{names:?}");
     }
 }

@@ -18,6 +18,11 @@ use crate::ops::cluster_attention::cluster_attention;
 use crate::ops::linear::linear_in_f32;
 use crate::tokens::clusters::ClusterIndex;
 
+/// Heads of the published condensers, whatever the number of encoder and renderer. A network too narrow for them, as in tests,
+/// has `num_heads` here too.
+const NUM_HEADS: usize = 8;
+const MIN_HEAD_WIDTH: usize = 8;
+
 /// One pre-norm decoder layer, in which each centroid attends to the tokens of its cluster, and a gate.
 ///
 /// The published weights depart from the paper: one block; residuals around all three parts; keys and values are all
@@ -41,9 +46,12 @@ struct ReleasedBlock {
 }
 
 impl ReleasedCondenser {
-    /// Makes a condenser of the sizes of `config`.
+    /// Makes a condenser of the sizes of `config`, with [`NUM_HEADS`] heads.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         let dim = config.dim;
+        let has_published_heads = dim.is_multiple_of(NUM_HEADS * MIN_HEAD_WIDTH);
+        let num_heads = if has_published_heads { NUM_HEADS } else { config.num_heads };
+        let config = &ModelConfig { num_heads, ..config.clone() };
         // The network for DL3DV has the same condenser: only its encoder and renderer have norms of queries and keys.
         init.without_query_key_norms(|init| Self {
             released: ReleasedBlock {
@@ -136,6 +144,16 @@ mod tests {
     use super::*;
     use crate::testing::{check_gradients, devices, random, small_config, to_f64};
     use crate::tokens::clusters::{Clusters, SceneClusters};
+
+    #[test]
+    fn published_condensers_have_eight_heads() {
+        for (dim, num_heads, expected) in [(512, 8, 8), (768, 12, 8), (16, 4, 4)] {
+            let config =
+                ModelConfig { dim, num_heads, feed_forward_dim: 8, ..small_config(CliftVariant::ReleasedRe10k) };
+            let condenser = ReleasedCondenser::new(&config, &mut Init::new(5, &devices()[0]));
+            assert_eq!(condenser.released.cluster_attn.num_heads(), expected, "{dim}");
+        }
+    }
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {

@@ -25,7 +25,7 @@ pub fn find_scene(source: &dyn SceneSource, key: Option<&str>) -> Result<usize, 
     }
 }
 
-/// Returns the positions of frames that are given by position or file name, with or without extension. Numbers alone are
+/// Returns the positions of frames that are given by position or file name, with or without extension and folders. Numbers alone are
 /// positions, unless one has leading zeros, as names of images have. `names` are those of all frames, in order.
 ///
 /// # Errors
@@ -39,10 +39,31 @@ pub fn frame_positions(frames: &[String], names: &[String]) -> Result<Vec<usize>
         return Ok(positions);
     }
     let position = |&frame: &&str| {
-        let has_stem = |name: &String| name.rsplit_once('.').is_some_and(|(stem, _)| stem == frame);
-        let named = names.iter().position(|name| name == frame).or_else(|| names.iter().position(has_stem));
+        let frame = &frame.replace('\\', "/");
+        let stem = |name: &str| name.rsplit_once('.').map_or(name.to_owned(), |(stem, _)| stem.to_owned());
+        let ends = |a: &str, b: &str| a.strip_suffix(b).is_some_and(|above| above.ends_with('/'));
+        let is_part = |name: &str| ends(name, frame) || ends(frame, name);
+        let found = |is_named: &dyn Fn(&str) -> bool| -> Vec<usize> {
+            (0..names.len()).filter(|position| is_named(&names[*position])).collect()
+        };
+        let is_named: [&dyn Fn(&str) -> bool; 4] =
+            [&|name| name == frame, &|name| stem(name) == *frame, &is_part, &|name| is_part(&stem(name))];
+        let found =
+            is_named.iter().map(|is_named| found(*is_named)).find(|found| !found.is_empty()).unwrap_or_default();
+        if let [first, _, ..] = found[..]
+            && names[first] != *frame
+            && stem(&names[first]) != *frame
+        {
+            let list =
+                found.iter().take(MAX_LISTED_NAMES).map(|position| names[*position].as_str()).collect::<Vec<_>>();
+            return Err(SceneError::request(format!(
+                "--context {frame}: {} frames have this name; write one of {}",
+                found.len(),
+                list.join(", ")
+            )));
+        }
         let number = || if is_padded(frame) { None } else { frame.parse().ok() };
-        named.or_else(number).ok_or_else(|| {
+        found.first().copied().or_else(number).ok_or_else(|| {
             let first = names.iter().take(MAX_LISTED_NAMES).map(String::as_str).collect::<Vec<_>>().join(", ");
             SceneError::request(match names.len() {
                 0 => format!("--context {frame}: the frames of this data set have no file names; write positions"),
@@ -73,6 +94,16 @@ mod tests {
             positions(&["a.jpg", "c.jpg"]).unwrap_err(),
             "--context: no frame c.jpg; the 5 frames start with a.jpg, b.v2.png, 7.png, 0, 003.jpg"
         );
+        let positions = |frame: &str| {
+            let names = ["back/0000.png", "back/1.png", "front/0000.png"].map(String::from);
+            frame_positions(&[frame.into()], &names).map_err(|error| error.to_string())
+        };
+        for frame in ["front/0000.png", "front/0000", "images/front/0000.png", "front\\0000.png"] {
+            assert_eq!(positions(frame), Ok(vec![2]), "{frame}");
+        }
+        assert_eq!(positions("1.png"), Ok(vec![1]));
+        let message = positions("0000.png").unwrap_err();
+        assert!(message.ends_with("2 frames have this name; write one of back/0000.png, front/0000.png"), "{message}");
         let message = frame_positions(&["a.jpg".into()], &[]).unwrap_err().to_string();
         assert!(message.contains("write positions"), "{message}");
     }

@@ -72,8 +72,10 @@ fn export_published(
     let codecs = [&model.weights, out].map(TokenCodec::path_of);
     let codec = codecs[0].exists().then(|| TokenCodec::read(&codecs[0])).transpose()?;
     require_absent(out)?;
-    if codec.is_some() {
-        require_absent(&codecs[1])?;
+    if codec.is_some() && codecs[1].symlink_metadata().is_ok() {
+        let fix =
+            "the token codec of the model is written there, beside the weights; move the file, or write another -o";
+        return Err(bad("token codec", codecs[1].display(), fix));
     }
     config.model.validate()?;
     if !config.model.architecture.supports_export() {

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::image::codec::decode_image;
 use crate::scene_source::{SceneSource, Split};
-use crate::skip_report::{SkipReport, note_on};
+use crate::skip_report::{SkipReport, note_on, plural};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::index_cache::{CachedChunk, CachedScene, ChunkIndexCache};
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
@@ -36,8 +36,9 @@ impl Chunk {
     fn find(&self) -> Result<(), DataError> {
         let metadata = std::fs::metadata(&self.path)
             .map_err(DataError::io("opening a chunk that index.json lists", &self.path))?;
-        if metadata.is_dir() {
-            let what = "a folder, which index.json lists as a chunk".into();
+        if !metadata.is_file() {
+            let what = if metadata.is_dir() { "a folder" } else { "a pipe or a device" };
+            let what = format!("{what}, which index.json lists as a chunk");
             return Err(DataError::BadChunk { what, path: self.path.clone() });
         }
         Ok(())
@@ -199,7 +200,32 @@ impl ChunkSource {
                 None => self.scenes.push(entry),
             }
         }
+        self.note_oddities();
         Ok(())
+    }
+
+    /// Reports the unusable frames of the scenes in memory, and chunks without checksums and time stamps.
+    fn note_oddities(&mut self) {
+        let mut report = std::mem::take(&mut self.report);
+        let (mut without_times, mut num_unchecked) = (Vec::new(), 0);
+        for (index, Entry { key, chunk }) in self.scenes.iter().enumerate() {
+            let table = self.chunks[*chunk].table.get().and_then(|table| table.scenes.get(key));
+            let unusable = table.map(|table| &table.unusable).or_else(|| Some(&self.cached(index)?.unusable));
+            for (frame, reason) in unusable.into_iter().flatten() {
+                report.skip_frame(key, frame.to_string(), reason);
+            }
+            without_times.extend(table.filter(|table| table.timestamps.is_none()).map(|_| key.clone()));
+        }
+        for chunk in &self.chunks {
+            num_unchecked += usize::from(chunk.table.get().is_some_and(|table| table.lacks_checksums));
+        }
+        let what = "without time stamps as int64, which are counted 0, 1, ..";
+        report.notes.extend(note_on(&without_times, what));
+        if num_unchecked > 0 {
+            let files = plural(num_unchecked, "file");
+            report.notes.push(format!("{files} without checksums: damage would not be noticed"));
+        }
+        self.report = report;
     }
 
     /// Reports the scenes of chunks that `index` does not list. Only chunks whose keys are in memory are examined.
@@ -229,7 +255,10 @@ impl ChunkSource {
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
         let num_frames = if filters.min_frames > 0 { self.num_frames(scene)? } else { 0 };
-        let fov_deg = self.cached(scene).and_then(|cached| cached.fov_deg);
+        let fov_deg = match self.cached(scene) {
+            Some(cached) => cached.fov_deg,
+            None => self.table(scene).ok().and_then(|(_, table)| table.fov_deg),
+        };
         filters.reason_to_skip(num_frames, || fov_deg.map_or_else(|| Ok(widest_fov_deg(&self.cameras(scene)?)), Ok))
     }
 
@@ -243,7 +272,9 @@ impl ChunkSource {
             path: chunk.path.clone(),
         })?;
         if scene.images.is_empty() {
-            let what = format!("scene {key} has no frames");
+            let reason =
+                scene.unusable.first().map_or_else(String::new, |(_, reason)| format!(" that can be used: {reason}"));
+            let what = format!("scene {key} has no frames{reason}");
             return Err(DataError::BadChunk { what, path: chunk.path.clone() });
         }
         Ok((&chunk.path, scene))

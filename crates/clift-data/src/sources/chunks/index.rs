@@ -7,7 +7,7 @@ use std::path::{Component, Path};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::files::bounded::parse_json;
+use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::{file_names, has_ending};
 use crate::skip_report::{SkipReport, first_few, note_on, plural};
 use crate::sources::chunks::table::ChunkTable;
@@ -16,10 +16,13 @@ use crate::sources::test_scenes::TestScenes;
 /// List of the authors' released code, beside one file per scene: keys of scenes whose images have another size.
 const INVALID_KEYS: &str = "invalid_keys.txt";
 
+/// Largest size of an `index.json`; the one of `RealEstate10K` has 3 MB.
+const MAX_INDEX_BYTES: u64 = 1 << 30;
+
 /// Reads `index.json`: file names by scene key.
 pub(crate) fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
     let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
-    let text = std::fs::read(path).map_err(DataError::io("reading the scene index", path))?;
+    let text = read_bounded(path, MAX_INDEX_BYTES, "reading the scene index")?;
     let index: BTreeMap<String, String> = parse_json(&text)
         .map_err(|error| bad(format!("expected a map from scene keys to chunk files, got {error}")))?;
     for (key, file) in &index {

@@ -13,7 +13,7 @@ use crate::error::DataError;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 
 /// Version of the file; other versions are ignored.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Scenes of a chunk.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,11 +25,14 @@ pub(crate) struct CachedChunk {
 }
 
 /// Values of a scene that the filters compare.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct CachedScene {
     pub num_frames: usize,
     /// Largest field of view of any frame, in degrees; `None` if not computed.
     pub fov_deg: Option<f64>,
+    /// Unusable frames with their reasons.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unusable: Vec<(usize, String)>,
 }
 
 impl CachedChunk {
@@ -45,8 +48,12 @@ impl CachedChunk {
         // Before reading: a file that changes meanwhile is read again at the next opening.
         let stamp = stamp(path).map_err(DataError::io("opening a chunk", path))?;
         let scene = |(key, scene): (&String, &SceneTable)| {
-            let fov_deg = if needs_fov { Some(widest_fov_deg(&scene.read_cameras(path)?)) } else { None };
-            Ok((key.clone(), CachedScene { num_frames: scene.images.len(), fov_deg }))
+            let fov_deg = match (needs_fov, scene.fov_deg) {
+                (true, None) => Some(widest_fov_deg(&scene.read_cameras(path)?)),
+                (true, known) => known,
+                (false, _) => None,
+            };
+            Ok((key.clone(), CachedScene { num_frames: scene.images.len(), fov_deg, unusable: scene.unusable.clone() }))
         };
         Ok(Self { stamp, scenes: table()?.scenes.iter().map(scene).collect::<Result<_, DataError>>()? })
     }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use clift_core::{Camera, IntrinsicsNorm};
+use clift_core::{Camera, IntrinsicsNorm, widest_fov_deg};
 
 use crate::error::DataError;
 use crate::image::codec::check_encoded;
@@ -17,25 +17,37 @@ use crate::torch::values::{ElementType, MAX_BYTES, MAX_VALUES, Value};
 /// a list of frames. Scenes without sharing have at least 8 values per frame, thus fewer frames than this.
 const MAX_FRAMES: usize = MAX_VALUES / 8;
 
+/// Largest number of unusable frames of a scene; with more, the scene is unusable.
+const MAX_UNUSABLE: usize = 1000;
+
 pub(crate) struct SceneTable {
     pub key: String,
     pub url: String,
-    timestamps: ByteSpan,
+    /// `None` for time stamps that are missing or not int64.
+    pub timestamps: Option<ByteSpan>,
     cameras: ByteSpan,
     camera_type: ElementType,
+    /// Images of the usable frames.
     pub images: Vec<ByteSpan>,
+    /// Frames of the file whose cameras cannot be used, in order, with the reasons.
+    pub unusable: Vec<(usize, String)>,
+    /// Largest field of view of the usable frames, in degrees; `None` for unreadable cameras.
+    pub fov_deg: Option<f64>,
 }
 
 pub(crate) struct ChunkTable {
     pub scenes: HashMap<String, SceneTable>,
+    /// Whether the file was written without checksums.
+    pub lacks_checksums: bool,
 }
 
 impl ChunkTable {
-    /// Reads the directory and the pickle of a chunk, and checks shape and bounds of every tensor.
+    /// Reads the directory, the pickle and the cameras of a chunk, and checks shape and bounds of every tensor that is used.
+    /// Other entries may hold any object, which is not executed.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let archive = Archive::open(path)?;
-        let pickle = Pickle::parse(&archive.read_pickle(path)?, path)?;
+        let pickle = Pickle::parse_checkpoint(&archive.read_pickle(path)?, path)?;
         // A chunk is a list of scenes; files of one scene hold its dict.
         let scenes: Vec<&Value> = match pickle.root() {
             Value::List(items) => items.iter().map(|id| pickle.get(*id)).collect(),
@@ -47,7 +59,11 @@ impl ChunkTable {
         for (position, scene) in scenes.into_iter().enumerate() {
             builder.add(scene).map_err(|what| bad(format!("scene {position}: {what}")))?;
         }
-        Ok(Self { scenes: builder.scenes })
+        let mut scenes = builder.scenes;
+        for scene in scenes.values_mut() {
+            scene.leave_out_unusable(path);
+        }
+        Ok(Self { scenes, lacks_checksums: archive.lacks_checksums() })
     }
 }
 
@@ -95,32 +111,69 @@ impl Builder<'_> {
         };
         let (cameras, camera_type) =
             tensor("cameras", &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64])?;
-        let (timestamps, _) = tensor("timestamps", &[Some(num_frames)], &[ElementType::I64])?;
-        let table = SceneTable { key: key.clone(), url: url.to_owned(), timestamps, cameras, camera_type, images };
-        self.scenes.insert(key.clone(), table);
+        let timestamps = tensor("timestamps", &[Some(num_frames)], &[ElementType::I64]).ok().map(|(span, _)| span);
+        let (key, url, unusable, fov_deg) = (key.clone(), url.to_owned(), Vec::new(), None);
+        let table = SceneTable { key, url, timestamps, cameras, camera_type, images, unusable, fov_deg };
+        self.scenes.insert(table.key.clone(), table);
         Ok(())
     }
 }
 
 impl SceneTable {
-    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
+    /// Leaves out the frames whose cameras cannot be used. An unreadable tensor of cameras is an error at its use.
+    fn leave_out_unusable(&mut self, path: &Path) {
+        let Ok(rows) = self.read_rows(path) else { return };
+        let mut cameras = Vec::with_capacity(rows.len());
+        for (frame, row) in rows.into_iter().enumerate() {
+            match Camera::from_re10k(row) {
+                Ok(camera) => cameras.push(camera),
+                Err(error) => self.unusable.push((frame, format!("whose camera cannot be used: {error}"))),
+            }
+            if self.unusable.len() > MAX_UNUSABLE {
+                self.unusable.truncate(1);
+                self.images.clear();
+                return;
+            }
+        }
+        self.fov_deg = Some(widest_fov_deg(&cameras));
+        let images = std::mem::take(&mut self.images);
+        self.images = self.usable(images);
+    }
+
+    fn is_usable(&self, frame: usize) -> bool {
+        self.unusable.binary_search_by_key(&frame, |(frame, _)| *frame).is_err()
+    }
+
+    /// Keeps the values of the usable frames, of values for all frames of the file.
+    fn usable<T>(&self, values: Vec<T>) -> Vec<T> {
+        if self.unusable.is_empty() {
+            return values;
+        }
+        values.into_iter().enumerate().filter(|(frame, _)| self.is_usable(*frame)).map(|(_, value)| value).collect()
+    }
+
+    fn read_rows(&self, path: &Path) -> Result<Vec<[f64; 18]>, DataError> {
         let bytes = self.cameras.read(path)?;
         let numbers: Vec<f64> = match self.camera_type {
             ElementType::F64 => bytes.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
             _ => bytes.as_chunks().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect(),
         };
-        let (rows, _) = numbers.as_chunks::<18>();
-        let camera = |(frame, row): (usize, &[f64; 18])| {
+        Ok(numbers.as_chunks::<18>().0.to_vec())
+    }
+
+    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
+        let camera = |row: &[f64; 18]| {
             Camera::from_re10k(*row).map_err(|source| DataError::BadChunk {
-                what: format!("scene {}, frame {frame}: {source}", self.key),
+                what: format!("scene {}: {source}", self.key),
                 path: path.to_path_buf(),
             })
         };
-        rows.iter().enumerate().map(camera).collect()
+        self.usable(self.read_rows(path)?).iter().map(camera).collect()
     }
 
     pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
-        Ok(self.timestamps.read(path)?.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
+        let Some(span) = self.timestamps else { return Ok((0..self.images.len() as i64).collect()) };
+        Ok(self.usable(span.read(path)?.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect()))
     }
 
     /// Checks the image files without decoding them. Returns the unreadable ones with the reason.
@@ -139,7 +192,7 @@ impl SceneTable {
         timestamps: &[i64],
         cameras: &[Camera<IntrinsicsNorm>],
     ) -> Result<bool, DataError> {
-        Ok(self.timestamps.read(path)? == timestamp_bytes(timestamps)
-            && self.cameras.read(path)? == camera_bytes(cameras))
+        let Some(span) = self.timestamps else { return Ok(false) };
+        Ok(span.read(path)? == timestamp_bytes(timestamps) && self.cameras.read(path)? == camera_bytes(cameras))
     }
 }

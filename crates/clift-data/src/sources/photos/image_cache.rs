@@ -119,9 +119,10 @@ impl ImageCache {
         let metadata = std::fs::metadata(&photo.path).ok()?;
         let time = metadata.modified().ok()?.duration_since(UNIX_EPOCH).ok()?;
         let path = std::path::absolute(&photo.path).ok()?;
-        let Photo { undistortion, shape, .. } = photo;
+        let Photo { undistortion, shape, view_turn, poses_from, .. } = photo;
         let (path, bytes) = (path.display(), metadata.len());
-        let key = format!("{path}\n{bytes} {time:?} {undistortion:?} {shape:?} {:?}", self.size);
+        let key =
+            format!("{path}\n{bytes} {time:?} {undistortion:?} {shape:?} {view_turn:?} {poses_from:?} {:?}", self.size);
         Some(format!("{}.{EXTENSION}", hex::encode(&Sha256::digest(key)[..16])))
     }
 

@@ -1,10 +1,12 @@
 //! Look-up of image files by name.
 
-use std::collections::{HashMap, HashSet};
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::ffi::OsString;
+use std::path::{Component, Path, PathBuf};
 
 use crate::error::DataError;
-use crate::files::listing::file_names;
+use crate::files::listing::{composed, decode_name, file_names, natural_order, raw_file_names};
+use crate::image::codec::read_header;
 use crate::sources::photos::photo::NO_IMAGE;
 
 /// Extensions of the formats that can be decoded.
@@ -19,34 +21,43 @@ pub(crate) struct ImageFolders {
 }
 
 struct ImageFolder {
-    by_stem: HashMap<String, Vec<String>>,
-    /// Files of other formats, by stem.
-    unreadable: HashMap<String, String>,
+    path: PathBuf,
+    /// Images by composed stem: decoded names, and names as stored.
+    by_stem: HashMap<String, Vec<(String, OsString)>>,
+    /// Composed stems of files of other formats.
+    unreadable: HashSet<String>,
     /// Requested stems with an image.
     requested: HashSet<String>,
 }
 
 impl ImageFolders {
-    /// Finds an image by its path: the file of that name, or the only file of that stem.
+    /// Finds an image by its path: the file of that name, or the only file of that stem. Names are compared as bytes, then
+    /// decoded and composed.
     ///
     /// # Errors
     /// A reason for the skip report.
     pub fn find(&mut self, path: &Path) -> Result<PathBuf, String> {
         let missing = || NO_IMAGE.to_owned();
-        let (Some(parent), Some(name)) = (path.parent(), path.file_name().and_then(|name| name.to_str())) else {
+        let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else {
             return Err(missing());
         };
         let folder = self.folder(parent).ok_or_else(missing)?;
-        let (stem, _) = split_name(name);
+        let name = decode_name(name.as_encoded_bytes());
+        let composed_name = composed(&name);
+        let (stem, _) = split_name(&composed_name);
         // A name without an extension may contain a dot: `frame.0001`.
-        let named = [name, stem].into_iter().find(|stem| folder.by_stem.contains_key(*stem));
+        let named = [&*composed_name, stem].into_iter().find(|stem| folder.by_stem.contains_key(*stem));
         folder.requested.extend(named.map(str::to_owned));
         let names = named.and_then(|stem| folder.by_stem.get(stem));
         match names.map(Vec::as_slice) {
-            Some(names) if names.iter().any(|other| other == name) => Ok(path.to_owned()),
-            Some([only]) => Ok(parent.join(only)),
-            Some(_) => Err("with several images of different extensions".into()),
-            None if folder.unreadable.contains_key(stem) => Err("whose image is neither JPEG nor PNG".into()),
+            Some([(_, only)]) => Ok(folder.path.join(only)),
+            Some(names) => {
+                let same = names.iter().find(|(other, _)| *other == name);
+                let same = same.or_else(|| names.iter().find(|(other, _)| composed(other) == composed_name));
+                same.map(|(_, name)| folder.path.join(name))
+                    .ok_or_else(|| "with several images of different extensions".into())
+            }
+            None if folder.unreadable.contains(stem) => Err("whose image is neither JPEG nor PNG".into()),
             None => Err(missing()),
         }
     }
@@ -61,39 +72,71 @@ impl ImageFolders {
         self.folder(folder).is_some()
     }
 
+    /// Returns whether the first image of a folder has at least these columns and rows; false for a folder without images.
+    pub fn is_at_least(&mut self, folder: &Path, [width, height]: [usize; 2]) -> bool {
+        let names = self.folder(folder).into_iter().flat_map(|folder| folder.by_stem.values().flatten());
+        let first = names.map(|(_, name)| name).min().map(|name| folder.join(name));
+        let size = first.and_then(|path| read_header(&path).ok()).map(|(size, _)| size);
+        size.is_some_and(|[columns, rows]| columns >= width && rows >= height)
+    }
+
     fn folder(&mut self, folder: &Path) -> Option<&mut ImageFolder> {
         let entry = self.folders.entry(folder.to_owned());
-        entry.or_insert_with_key(|folder| ImageFolder::read(folder).ok()).as_mut()
+        let read = |folder: &Path| ImageFolder::read(folder).ok();
+        entry.or_insert_with_key(|folder| read(folder).or_else(|| read(&stored_folder(folder)?))).as_mut()
     }
+}
+
+/// Returns the folder whose path has the same characters, composed or not.
+fn stored_folder(folder: &Path) -> Option<PathBuf> {
+    if folder.as_os_str().is_ascii() || folder.is_dir() {
+        return Some(folder.to_owned());
+    }
+    let Some(Component::Normal(name)) = folder.components().next_back() else { return None };
+    let name = decode_name(name.as_encoded_bytes());
+    let parent = stored_folder(folder.parent()?)?;
+    let is_same = |other: &OsString| composed(&decode_name(other.as_encoded_bytes())) == composed(&name);
+    let found = raw_file_names(&parent).ok()?.into_iter().find(is_same)?;
+    Some(parent.join(found))
 }
 
 impl ImageFolder {
     fn read(folder: &Path) -> Result<Self, DataError> {
-        let mut read = Self { by_stem: HashMap::new(), unreadable: HashMap::new(), requested: HashSet::new() };
-        for name in file_names(folder)? {
+        let (by_stem, requested) = (HashMap::new(), HashSet::new());
+        let mut read = Self { path: folder.to_owned(), by_stem, unreadable: HashSet::new(), requested };
+        for stored in raw_file_names(folder)? {
+            let name = decode_name(stored.as_encoded_bytes());
             let (stem, extension) = split_name(&name);
             let Some(extension) = extension.map(str::to_ascii_lowercase) else { continue };
+            let stem = composed(stem).into_owned();
             if EXTENSIONS.contains(&extension.as_str()) {
-                read.by_stem.entry(stem.to_owned()).or_default().push(name);
+                read.by_stem.entry(stem).or_default().push((name, stored));
             } else if OTHER_EXTENSIONS.contains(&extension.as_str()) {
-                read.unreadable.insert(stem.to_owned(), name);
+                read.unreadable.insert(stem);
             }
         }
         Ok(read)
     }
 }
 
+/// Returns the images of a folder in the natural order of their names.
+pub(crate) fn images_in(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
+    let mut names = file_names(folder)?;
+    let is_image = |ending: &str| EXTENSIONS.contains(&ending.to_ascii_lowercase().as_str());
+    names.retain(|name| split_name(name).1.is_some_and(is_image));
+    names.sort_by(|a, b| natural_order(a, b));
+    Ok(names.into_iter().map(|name| folder.join(name)).collect())
+}
+
 /// Returns the images whose names are numbers (time stamps), by number; of `77` and `077`, the first in order of names.
-pub(crate) fn numbered_images(folder: &Path) -> Result<HashMap<i64, PathBuf>, DataError> {
-    let mut numbered = HashMap::new();
-    for name in file_names(folder)? {
-        let (stem, extension) = split_name(&name);
-        let is_image = extension.is_some_and(|ending| EXTENSIONS.contains(&ending.to_ascii_lowercase().as_str()));
-        if let (true, Ok(number)) = (is_image, stem.parse()) {
-            numbered.entry(number).or_insert_with(|| folder.join(&name));
+pub(crate) fn numbered_images(images: &[PathBuf]) -> BTreeMap<i64, &PathBuf> {
+    let mut numbered = BTreeMap::new();
+    for path in images {
+        if let Some(number) = path.file_stem().and_then(|stem| stem.to_str()?.parse().ok()) {
+            numbered.entry(number).or_insert(path);
         }
     }
-    Ok(numbered)
+    numbered
 }
 
 /// Returns the number of images in a folder and its subfolders, of other formats too.
@@ -158,10 +201,9 @@ mod tests {
         for name in ["0077.jpg", "77.png", "12.png", "-3.png", "x.png", "9.txt"] {
             std::fs::write(folder.path().join(name), "").unwrap();
         }
-        let numbered = numbered_images(folder.path()).unwrap();
-        let mut numbers: Vec<_> = numbered.keys().copied().collect();
-        numbers.sort_unstable();
-        assert_eq!(numbers, [-3, 12, 77]);
-        assert_eq!(numbered[&77], folder.path().join("0077.jpg"));
+        let images = images_in(folder.path()).unwrap();
+        let numbered = numbered_images(&images);
+        assert_eq!(numbered.keys().copied().collect::<Vec<_>>(), [-3, 12, 77]);
+        assert_eq!(*numbered[&77], folder.path().join("0077.jpg"));
     }
 }

@@ -2,6 +2,8 @@
 
 use std::path::{Component, Path, PathBuf};
 
+use percent_encoding::percent_decode_str;
+
 use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{NO_IMAGE, PhotoOptions};
 
@@ -11,13 +13,19 @@ const MAX_SUFFIX_PARTS: usize = 32;
 /// Finds the images of a scene folder by the names in its camera file.
 pub(crate) struct ImageLocator<'a> {
     folder: &'a Path,
-    options: &'a PhotoOptions,
     folders: ImageFolders,
+    /// The configured image folder, or a default folder.
+    image_folder: Option<PathBuf>,
 }
 
 impl<'a> ImageLocator<'a> {
-    pub fn new(folder: &'a Path, options: &'a PhotoOptions) -> Self {
-        Self { folder, options, folders: ImageFolders::default() }
+    pub fn new(folder: &'a Path, options: &PhotoOptions) -> Self {
+        let mut folders = ImageFolders::default();
+        let image_folder = match &options.image_folder {
+            Some(name) => Some(folder.join(name)),
+            None => default_folder(folder, options, &mut folders),
+        };
+        Self { folder, folders, image_folder }
     }
 
     /// Returns the number of images in the searched folders that no name has found.
@@ -25,19 +33,14 @@ impl<'a> ImageLocator<'a> {
         self.folders.num_unrequested()
     }
 
-    /// Returns the path of an image, or why there is none. The name may have the separators of another system, belong to
-    /// another computer, or name an image of which only scaled copies exist.
+    /// Returns the path of an image, or why there is none. The name may have the separators of another system, be that of
+    /// a URL, belong to another computer, or name an image of which only scaled copies exist.
     pub fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
-        let found = self.find_at(Path::new(file_path));
-        if found.is_ok() || !file_path.contains('\\') {
-            return found;
-        }
-        // Separator of Windows; some tools mix both.
-        self.find_at(Path::new(&file_path.replace('\\', "/")))
+        first_found(file_path, |name| self.find_at(Path::new(name)))
     }
 
     fn find_at(&mut self, named: &Path) -> Result<PathBuf, String> {
-        if let Some(folder) = self.image_folder() {
+        if let Some(folder) = self.image_folder.clone() {
             let below =
                 if is_absolute(named) { self.longest_suffix(&folder, named) } else { without_first_folder(named) };
             return self.folders.find(&folder.join(below));
@@ -65,15 +68,6 @@ impl<'a> ImageLocator<'a> {
         Err(NO_IMAGE.into())
     }
 
-    /// Returns the configured image folder, or the first existing default folder.
-    fn image_folder(&mut self) -> Option<PathBuf> {
-        if let Some(folder) = &self.options.image_folder {
-            return Some(self.folder.join(folder));
-        }
-        let mut folders = self.options.first_folders.iter().map(|folder| self.folder.join(folder));
-        folders.find(|folder| self.folders.has(folder))
-    }
-
     /// Returns the longest suffix of a path whose parent exists in `folder`.
     fn longest_suffix(&mut self, folder: &Path, named: &Path) -> PathBuf {
         let mut suffixes = path_suffixes(named);
@@ -81,6 +75,30 @@ impl<'a> ImageLocator<'a> {
             suffixes.find(|suffix| suffix.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
         found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
     }
+}
+
+/// Tries the spellings of a name: as it is, with the separators of Windows (some tools mix both) and with the `%20` of a URL.
+///
+/// # Errors
+/// That of the name as it is.
+pub(crate) fn first_found(
+    name: &str,
+    mut find: impl FnMut(&str) -> Result<PathBuf, String>,
+) -> Result<PathBuf, String> {
+    find(name).or_else(|error| {
+        let decode = |name: &str| percent_decode_str(name).decode_utf8().map(std::borrow::Cow::into_owned).ok();
+        let slashes = name.contains('\\').then(|| name.replace('\\', "/"));
+        let decoded = name.contains('%').then(|| decode(slashes.as_deref().unwrap_or(name))).flatten();
+        [slashes, decoded].into_iter().flatten().find_map(|name| find(&name).ok()).ok_or(error)
+    })
+}
+
+/// Returns the first default image folder whose images have the smallest size, or else the first that exists.
+fn default_folder(folder: &Path, options: &PhotoOptions, folders: &mut ImageFolders) -> Option<PathBuf> {
+    let mut existing: Vec<PathBuf> = options.first_folders.iter().map(|name| folder.join(name)).collect();
+    existing.retain(|folder| folders.has(folder));
+    let large = existing.iter().position(|folder| folders.is_at_least(folder, options.min_size));
+    (!existing.is_empty()).then(|| existing.swap_remove(large.unwrap_or_default()))
 }
 
 /// Returns the suffixes of a path, from the longest (at most [`MAX_SUFFIX_PARTS`] parts) to the file name.

@@ -7,7 +7,7 @@ use std::fmt;
 use std::marker::PhantomData;
 use std::path::Path;
 
-use clift_core::{Intrinsics, IntrinsicsNorm, Pose, folder_of};
+use clift_core::{DVec3, Intrinsics, IntrinsicsNorm, Pose, folder_of};
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
@@ -16,13 +16,19 @@ use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::natural_order;
 use crate::geometry::lens::Lens;
 use crate::image::codec::read_header;
+use crate::skip_report::plural;
 use crate::sources::photos::image_locator::ImageLocator;
-use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene, unusable};
 
 /// Largest size of a `transforms.json`, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
 /// Longest name of an image, in bytes: the limit of operating systems for a path.
 const MAX_NAME_BYTES: usize = 4096;
+
+/// Smallest ratio of twice the principal point to the image at which the image counts as smaller than the calibration.
+const MIN_CALIBRATED_SCALE: f64 = 1.5;
+/// Largest share by which a principal point is off the image centre there.
+const MAX_CENTRE_OFFSET: f64 = 0.1;
 
 /// Defines a struct with the keys of a camera, which may occur at the top level and in a frame.
 macro_rules! with_optics {
@@ -32,20 +38,20 @@ macro_rules! with_optics {
             $($field: $type,)*
             camera_model: Option<String>,
             is_fisheye: Option<bool>,
-            w: Option<f64>,
-            h: Option<f64>,
-            fl_x: Option<f64>,
-            fl_y: Option<f64>,
-            cx: Option<f64>,
-            cy: Option<f64>,
-            camera_angle_x: Option<f64>,
-            camera_angle_y: Option<f64>,
-            k1: Option<f64>,
-            k2: Option<f64>,
-            k3: Option<f64>,
-            k4: Option<f64>,
-            p1: Option<f64>,
-            p2: Option<f64>,
+            w: Option<Number>,
+            h: Option<Number>,
+            fl_x: Option<Number>,
+            fl_y: Option<Number>,
+            cx: Option<Number>,
+            cy: Option<Number>,
+            camera_angle_x: Option<Number>,
+            camera_angle_y: Option<Number>,
+            k1: Option<Number>,
+            k2: Option<Number>,
+            k3: Option<Number>,
+            k4: Option<Number>,
+            p1: Option<Number>,
+            p2: Option<Number>,
         }
 
         impl $name {
@@ -53,25 +59,60 @@ macro_rules! with_optics {
                 Optics {
                     camera_model: self.camera_model.as_deref(),
                     is_fisheye: self.is_fisheye,
-                    size: [self.w, self.h],
-                    focal: [self.fl_x, self.fl_y],
-                    centre: [self.cx, self.cy],
-                    angle: [self.camera_angle_x, self.camera_angle_y],
-                    radial: [self.k1, self.k2, self.k3, self.k4],
-                    tangential: [self.p1, self.p2],
+                    size: values([self.w, self.h]),
+                    focal: values([self.fl_x, self.fl_y]),
+                    centre: values([self.cx, self.cy]),
+                    angle: values([self.camera_angle_x, self.camera_angle_y]),
+                    radial: values([self.k1, self.k2, self.k3, self.k4]),
+                    tangential: values([self.p1, self.p2]),
                 }
             }
         }
     };
 }
 
-with_optics!(Document { frames: Bounded<Entry, MAX_FRAMES>, });
-with_optics!(Entry { file_path: String, transform_matrix: Bounded<[f64; 4], 4>, });
+with_optics!(Document {
+    frames: Bounded<Entry, MAX_FRAMES>,
+    train_filenames: Option<Bounded<String, MAX_FRAMES>>,
+    val_filenames: Option<Bounded<String, MAX_FRAMES>>,
+    test_filenames: Option<Bounded<String, MAX_FRAMES>>,
+});
+with_optics!(Entry { file_path: String, transform_matrix: Option<Bounded<[Number; 4], 4>>, });
+
+impl Document {
+    /// Returns which frames the file holds out of training: those that are not in `train_filenames`, or those in
+    /// `val_filenames` and `test_filenames`; `None` without such lists.
+    fn held_out(&self) -> Option<impl Fn(&str) -> bool> {
+        let names = |list: &'_ Option<Bounded<String, MAX_FRAMES>>| -> HashSet<String> {
+            list.iter().flat_map(|list| &list.0).cloned().collect()
+        };
+        let train = names(&self.train_filenames);
+        let held_out = &names(&self.val_filenames) | &names(&self.test_filenames);
+        let has_list = !(train.is_empty() && held_out.is_empty());
+        has_list
+            .then_some(move |name: &str| if train.is_empty() { held_out.contains(name) } else { !train.contains(name) })
+    }
+}
 
 impl Entry {
+    /// Returns the camera-to-world pose, and the scale of the matrix if it was divided out.
+    fn pose(&self) -> Result<(Pose, Option<f64>), String> {
+        let rows = self.c2w_rows()?;
+        let error = match Pose::from_opengl(&rows) {
+            Ok(pose) => return Ok((pose, None)),
+            Err(error) => error.to_string(),
+        };
+        let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
+        let scale = x.dot(y.cross(z)).cbrt();
+        let scaled = rows.map(|[a, b, c, t]| [a / scale, b / scale, c / scale, t]);
+        let pose = Some(scale).filter(|scale| *scale > 0.0).and_then(|_| Pose::from_opengl(&scaled).ok());
+        pose.map(|pose| (pose, Some(scale))).ok_or(error)
+    }
+
     /// Returns the upper three rows of the matrix; the fourth is optional.
     fn c2w_rows(&self) -> Result<[[f64; 4]; 3], String> {
-        let rows = &self.transform_matrix.0;
+        let rows = self.transform_matrix.as_ref().ok_or("no transform_matrix")?;
+        let rows: Vec<[f64; 4]> = rows.0.iter().map(|row| row.each_ref().map(|number| number.0)).collect();
         if let Some(last) = rows.get(3) {
             let error = last.iter().zip([0.0, 0.0, 0.0, 1.0]).map(|(got, expected)| (got - expected).abs());
             if error.fold(0.0, f64::max) > 1e-6 {
@@ -141,6 +182,20 @@ impl<'a> Optics<'a> {
         Ok(Some([width, height]))
     }
 
+    /// Returns the size of the images to which the intrinsics apply where it is not given and images of `size` pixels are
+    /// smaller: twice the principal point, as the nearest multiple of `size`.
+    fn calibrated_size(&self, size: [f64; 2]) -> Option<[f64; 2]> {
+        let ([Some(cx), Some(cy)], [Some(_), _] | [_, Some(_)]) = (self.centre, self.focal) else { return None };
+        let [x, y] = [2.0 * cx / size[0], 2.0 * cy / size[1]];
+        let scale = 0.5 * (x + y);
+        if !scale.is_finite() || scale < MIN_CALIBRATED_SCALE || (x / y - 1.0).abs() > MAX_CENTRE_OFFSET {
+            return None;
+        }
+        let multiple = scale.round();
+        let scale = if (scale / multiple - 1.0).abs() < MAX_CENTRE_OFFSET { multiple } else { scale };
+        Some(size.map(|side| side * scale))
+    }
+
     fn intrinsics_norm(&self, [width, height]: [f64; 2]) -> Result<IntrinsicsNorm, String> {
         let from_angle = |axis: usize, side: f64| self.angle[axis].map(|angle| 0.5 * side / (0.5 * angle).tan());
         let [x, y] = [self.focal[0].or_else(|| from_angle(0, width)), self.focal[1].or_else(|| from_angle(1, height))];
@@ -158,7 +213,8 @@ impl<'a> Optics<'a> {
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
-    let document: Document = parse_json(&text).map_err(|error| bad(explain(&error, &text)))?;
+    let document: Document =
+        parse(&text).map_err(|error| bad(format!("expected the format of nerfstudio, got {error}")))?;
     drop(text);
     let folder = folder_of(path);
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
@@ -169,44 +225,136 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
     let mut images = ImageLocator::new(folder, options);
     let (top, mut scene) = (document.optics(), PhotoScene::default());
-    let mut used = HashSet::new();
+    let held_out = document.held_out();
+    let (mut used, mut num_scaled, mut num_guessed) = (HashSet::new(), (0, 0.0), (0, [0.0; 2]));
     for entry in entries {
         let name = &entry.file_path;
-        let in_frame = |what: String| bad(format!("frame {name}: {what}"));
-        let image = match images.find(name) {
-            Ok(image) if used.insert(image.clone()) => image,
-            found => {
-                scene.skip(name, found.map_or_else(|reason| reason, |_| "with the image of another frame".into()));
-                continue;
+        let found = images.find(name).and_then(|image| {
+            if used.insert(image.clone()) { Ok(image) } else { Err("with the image of another frame".into()) }
+        });
+        let photo = found.and_then(|image| {
+            let optics = entry.optics().or(&top);
+            let lens = optics.lens().map_err(|what| unusable(&what))?;
+            let mut given = optics.size().map_err(|what| unusable(&what))?;
+            let size = if let Some(size) = given {
+                size
+            } else {
+                let (stored, tag) = read_header(&image).map_err(|_| "whose image cannot be read".to_owned())?;
+                let size = options.size_of_poses(stored, tag).map(|side| side as f64);
+                given = optics.calibrated_size(size);
+                num_guessed = given.map_or(num_guessed, |guess| (num_guessed.0 + 1, guess));
+                given.unwrap_or(size)
+            };
+            let intrinsics_norm = optics.intrinsics_norm(size).map_err(|what| unusable(&what))?;
+            let (c2w, scale) = entry.pose().map_err(|what| unusable(&what))?;
+            num_scaled = scale.map_or(num_scaled, |scale| (num_scaled.0 + 1, scale));
+            Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)).map_err(|error| unusable(&error))
+        });
+        match photo {
+            Ok(photo) => {
+                let is_held_out = held_out.as_ref().map(|is_held_out| is_held_out(name));
+                scene.photos.push(Photo { is_held_out, ..photo });
             }
-        };
-        let optics = entry.optics().or(&top);
-        let lens = optics.lens().map_err(in_frame)?;
-        let given = optics.size().map_err(in_frame)?;
-        let size = given.map_or_else(|| read_header(&image).map(|(size, _)| size.map(|side| side as f64)), Ok);
-        let Ok(size) = size else {
-            scene.skip(name, "whose image cannot be read");
-            continue;
-        };
-        let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
-        let rows = entry.c2w_rows().map_err(in_frame)?;
-        let photo = Pose::from_opengl(&rows)
-            .map_err(DataError::from)
-            .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)))
-            .map_err(PhotoScene::in_frame(path, name))?;
-        scene.photos.push(photo);
+            Err(reason) => scene.skip(name, reason),
+        }
+    }
+    if held_out.is_some() {
+        let count = scene.photos.iter().filter(|photo| photo.is_held_out == Some(true)).count();
+        let of = plural(scene.photos.len(), "frame");
+        scene.notes.push(format!("{count} of {of} held out by the lists of file names in {}", path.display()));
+    }
+    if num_scaled.0 > 0 {
+        scene.notes.push(format!(
+            "{} with a scaled rotation in {}: the scale, {:.3}, was divided out",
+            plural(num_scaled.0, "frame"),
+            path.display(),
+            num_scaled.1
+        ));
+    }
+    if num_guessed.0 > 0 {
+        let (count, [width, height]) = num_guessed;
+        scene.notes.push(format!(
+            "{} without w and h in {}, smaller than their principal point says: the intrinsics are taken as those of \
+             images of {width:.0}x{height:.0}; write w and h",
+            plural(count, "image"),
+            path.display()
+        ));
     }
     scene.num_without_camera = images.num_unrequested();
     Ok(scene)
 }
 
-/// Returns the message of the parser, with a hint on NaN and infinite numbers, which Python writes and JSON does not have.
-fn explain(error: &serde_json::Error, text: &[u8]) -> String {
-    let line = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
-    let column = error.column().min(line.len());
-    let near = String::from_utf8_lossy(&line[column.saturating_sub(9)..line.len().min(column + 9)]);
-    let hint = if near.contains("NaN") || near.contains("Infinity") { " (a number is NaN or infinite)" } else { "" };
-    format!("expected the format of nerfstudio, got {error}{hint}")
+/// Parses a document. Python and C++ write NaN and infinite numbers, which JSON does not have.
+fn parse(text: &[u8]) -> Result<Document, serde_json::Error> {
+    parse_json(text).or_else(|error| parse_json(&with_quoted_numbers(text).ok_or(error)?))
+}
+
+/// Returns JSON text with words such as `NaN`, `-Infinity` and `-nan(ind)` in quotes; `None` without such words.
+fn with_quoted_numbers(text: &[u8]) -> Option<Vec<u8>> {
+    let (mut quoted, mut is_string, mut at, mut has_words) = (Vec::with_capacity(text.len() + 64), false, 0, false);
+    while let Some(&byte) = text.get(at) {
+        let is_part = |byte: &u8| byte.is_ascii_alphanumeric() || b"+-.()#_".contains(byte);
+        let length = if is_string { 0 } else { text[at..].iter().take_while(|byte| is_part(byte)).count() };
+        let word = &text[at..at + length];
+        let lower = word.iter().take(16).map(u8::to_ascii_lowercase).collect::<Vec<u8>>();
+        if [&b"nan"[..], b"inf", b"#ind", b"#qnan"].iter().any(|part| lower.windows(part.len()).any(|w| w == *part)) {
+            quoted.extend([b"\"", word, b"\""].concat());
+            has_words = true;
+        } else if length > 0 {
+            quoted.extend(word);
+        } else {
+            let length = if is_string && byte == b'\\' { 2 } else { 1 };
+            is_string ^= byte == b'"';
+            quoted.extend(text[at..].iter().take(length));
+            at += length;
+        }
+        at += word.len();
+    }
+    has_words.then_some(quoted)
+}
+
+/// A number, NaN for null and for the text of [`with_quoted_numbers`].
+#[derive(Clone, Copy)]
+struct Number(f64);
+
+impl<'de> Deserialize<'de> for Number {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(NumberVisitor)
+    }
+}
+
+struct NumberVisitor;
+
+impl Visitor<'_> for NumberVisitor {
+    type Value = Number;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a number")
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<Number, E> {
+        Ok(Number(value))
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<Number, E> {
+        Ok(Number(value as f64))
+    }
+
+    fn visit_u64<E>(self, value: u64) -> Result<Number, E> {
+        Ok(Number(value as f64))
+    }
+
+    fn visit_str<E: Error>(self, text: &str) -> Result<Number, E> {
+        Ok(Number(text.parse().unwrap_or(f64::NAN)))
+    }
+
+    fn visit_unit<E>(self) -> Result<Number, E> {
+        Ok(Number(f64::NAN))
+    }
+}
+
+fn values<const N: usize>(numbers: [Option<Number>; N]) -> [Option<f64>; N] {
+    numbers.map(|number| number.map(|Number(value)| value))
 }
 
 /// A list of at most `MAX` items, because parsed JSON takes up to a hundred times the memory of its text.

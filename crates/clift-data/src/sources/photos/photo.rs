@@ -1,14 +1,18 @@
 //! An image file with its camera, and a scene of such photos, in any layout with one file per frame.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-use clift_core::{Camera, IntrinsicsNorm, Pose, RgbImage};
+use clift_core::{Camera, DMat3, IntrinsicsNorm, Pose, RgbImage};
 use image::metadata::Orientation;
+use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
+use crate::files::listing::decode_name;
 use crate::geometry::lens::Lens;
 use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
+use crate::image::jpeg_scan::check_scans;
 use crate::image::undistort::Undistortion;
 
 pub(crate) const MAX_FRAMES: usize = 100_000;
@@ -16,6 +20,17 @@ pub(crate) const MAX_FRAMES: usize = 100_000;
 const MAX_IMAGE_BYTES: u64 = 256 << 20;
 /// Largest relative error of an image's aspect ratio against its camera's: rounding of images a few dozen pixels wide.
 const MAX_SHAPE_ERROR: f64 = 0.02;
+
+/// Pixels of a photo with an EXIF orientation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PosesFrom {
+    /// Pixels as the file stores them.
+    #[default]
+    Stored,
+    /// Pixels turned by the orientation.
+    Turned,
+}
 
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoOptions {
@@ -25,6 +40,17 @@ pub(crate) struct PhotoOptions {
     pub first_folders: &'static [&'static str],
     /// Whether images are undistorted; otherwise lens distortion is ignored.
     pub undistort: bool,
+    /// Smallest columns and rows of the images of a default folder.
+    pub min_size: [usize; 2],
+    /// Pixels from which poses were computed where the cameras fit both.
+    pub poses_from: PosesFrom,
+}
+
+impl PhotoOptions {
+    /// Returns columns and rows of the pixels from which the poses of an image were computed.
+    pub fn size_of_poses(&self, [width, height]: [usize; 2], tag: Orientation) -> [usize; 2] {
+        if self.poses_from == PosesFrom::Turned && exchanges(tag) { [height, width] } else { [width, height] }
+    }
 }
 
 #[derive(Clone, Debug)]
@@ -38,20 +64,47 @@ pub(crate) struct Photo {
     pub shape: Option<f64>,
     /// Time stamp in microseconds, or the number at the end of the file name.
     pub time: Option<i64>,
+    /// Whether the frame is held out of training; `None` if the camera file does not say.
+    pub is_held_out: Option<bool>,
+    /// Orientation by which the undistorted image is turned, as `camera` was.
+    pub view_turn: Orientation,
+    /// Pixels from which the pose was computed, where the camera fits both.
+    pub poses_from: PosesFrom,
 }
 
 /// Header of a photo.
 pub(crate) struct PhotoHeader {
-    /// Columns and rows in the orientation of the camera.
+    /// Columns and rows of the turned image.
     pub size: [usize; 2],
-    /// Whether the EXIF orientation is applied.
-    pub is_turned: bool,
-    /// Whether there is an EXIF orientation that is not applied.
-    pub has_unused_orientation: bool,
+    pub turn: Turn,
+}
+
+/// How the EXIF orientation of a photo is used. Some tools compute cameras from stored pixels, others turn them first.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Turn {
+    /// Turns the pixels alone, to those of the camera.
+    pub pixels: Orientation,
+    /// Turns image and camera together, so that the view is upright.
+    pub view: Orientation,
+    /// Whether the cameras fit the stored and the turned pixels.
+    pub is_undecided: bool,
+    /// Whether the orientation is not used: a camera cannot mirror.
+    pub is_unused: bool,
+}
+
+impl Turn {
+    pub fn is_any(self) -> bool {
+        self.pixels != Orientation::NoTransforms || self.view != Orientation::NoTransforms
+    }
 }
 
 /// [`MissingPhoto::reason`] of a file that does not exist.
 pub(crate) const NO_IMAGE: &str = "without an image";
+
+/// Returns the reason to skip a frame whose camera has this error.
+pub(crate) fn unusable(error: &impl Display) -> String {
+    format!("whose camera cannot be used: {error}")
+}
 
 /// A frame without a usable image, by its name in the camera file.
 pub(crate) struct MissingPhoto {
@@ -84,19 +137,20 @@ impl Photo {
         (lens, undistort): (Lens, bool),
     ) -> Result<Self, DataError> {
         intrinsics_norm.validate()?;
-        let (time, shape) = (number_at_end(&path), size.map(|[width, height]| width / height));
-        if !undistort || lens.is_pinhole() {
-            return Ok(Self {
-                path,
-                camera: Camera { intrinsics: intrinsics_norm, c2w },
-                undistortion: None,
-                shape,
-                time,
-            });
+        let mut photo = Self::pinhole(path, Camera { intrinsics: intrinsics_norm, c2w });
+        (photo.time, photo.shape) = (number_at_end(&photo.path), size.map(|[width, height]| width / height));
+        if undistort && !lens.is_pinhole() {
+            let undistortion = Undistortion::new(intrinsics_norm, lens)?;
+            photo.camera.intrinsics = undistortion.intrinsics_norm();
+            photo.undistortion = Some(Box::new(undistortion));
         }
-        let undistortion = Undistortion::new(intrinsics_norm, lens)?;
-        let camera = Camera { intrinsics: undistortion.intrinsics_norm(), c2w };
-        Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape, time })
+        Ok(photo)
+    }
+
+    /// Creates a photo of a pinhole camera.
+    pub fn pinhole(path: PathBuf, camera: Camera<IntrinsicsNorm>) -> Self {
+        let (view_turn, poses_from) = (Orientation::NoTransforms, PosesFrom::default());
+        Self { path, camera, undistortion: None, shape: None, time: None, is_held_out: None, view_turn, poses_from }
     }
 
     pub fn read(&self) -> Result<Vec<u8>, DataError> {
@@ -106,52 +160,85 @@ impl Photo {
     /// Reads the header and the end of the image file, and checks the aspect ratio.
     pub fn header(&self) -> Result<PhotoHeader, DataError> {
         let (stored, tag) = read_header(&self.path)?;
-        let orientation = self.orientation(stored, || tag)?;
+        let turn = self.turn(stored, tag)?;
         check_end(&self.path, MAX_IMAGE_BYTES)?;
         let [width, height] = stored;
-        let is_turned = orientation != Orientation::NoTransforms;
-        Ok(PhotoHeader {
-            size: if is_turned { [height, width] } else { stored },
-            is_turned,
-            has_unused_orientation: !is_turned && tag != Orientation::NoTransforms,
-        })
+        let size = if exchanges(turn.pixels) || exchanges(turn.view) { [height, width] } else { stored };
+        Ok(PhotoHeader { size, turn })
+    }
+
+    /// Checks a JPEG file for damage in its middle.
+    pub fn check_data(&self) -> Result<(), DataError> {
+        let bytes = self.read()?;
+        let is_jpeg = bytes.starts_with(b"\xff\xd8");
+        let checked = if is_jpeg { check_scans(&bytes) } else { Ok(()) };
+        checked.map_err(|what| DataError::DamagedImage { what, path: self.path.clone() })
     }
 
     /// Decodes the image, turns it to the orientation of its camera and undistorts it.
     pub fn decode(&self, key: &str, frame: usize) -> Result<RgbImage, DataError> {
         let bytes = self.read()?;
         let image = decode_image(&bytes, key, frame)?;
-        let orientation = self.orientation([image.width, image.height], || exif_orientation(&bytes))?;
-        let image = match orientation {
-            Orientation::NoTransforms => image,
-            orientation => apply_orientation(image, orientation),
-        };
-        Ok(match &self.undistortion {
+        let stored = [image.width, image.height];
+        let is_plain = self.poses_from == PosesFrom::Stored && self.fits(stored);
+        let pixels =
+            if is_plain { Orientation::NoTransforms } else { self.turn(stored, exif_orientation(&bytes))?.pixels };
+        let image = apply_orientation(image, pixels);
+        let image = match &self.undistortion {
             Some(undistortion) => undistortion.apply(&image),
             None => image,
-        })
+        };
+        Ok(apply_orientation(image, self.view_turn))
     }
 
-    /// Returns how the stored pixels are turned: not at all if their aspect ratio is that of the camera, and by the EXIF
-    /// orientation if only the turned image has it. Some tools compute cameras from stored pixels, others turn them first.
-    fn orientation(
-        &self,
-        [width, height]: [usize; 2],
-        tag: impl FnOnce() -> Orientation,
-    ) -> Result<Orientation, DataError> {
-        let Some(expected) = self.shape else { return Ok(Orientation::NoTransforms) };
-        let shape = width as f64 / height as f64;
-        let fits = |shape: f64| (shape / expected - 1.0).abs() <= MAX_SHAPE_ERROR;
-        if fits(shape) {
-            return Ok(Orientation::NoTransforms);
-        }
-        let tag = tag();
-        // Orientations of 5 and more exchange columns and rows.
-        if tag.to_exif() >= 5 && fits(1.0 / shape) {
-            return Ok(tag);
-        }
-        Err(DataError::WrongAspect { width, height, camera_aspect: expected, path: self.path.clone() })
+    /// Turns the camera, and on load the image, by an orientation that does not mirror.
+    pub fn turn_view(&mut self, orientation: Orientation) {
+        let IntrinsicsNorm { fx, fy, cx, cy } = self.camera.intrinsics;
+        let (intrinsics, columns) = match orientation {
+            Orientation::Rotate90 => ([fy, fx, 1.0 - cy, cx], [[0.0, -1.0], [1.0, 0.0]]),
+            Orientation::Rotate180 => ([fx, fy, 1.0 - cx, 1.0 - cy], [[-1.0, 0.0], [0.0, -1.0]]),
+            Orientation::Rotate270 => ([fy, fx, cy, 1.0 - cx], [[0.0, 1.0], [-1.0, 0.0]]),
+            _ => return,
+        };
+        let [fx, fy, cx, cy] = intrinsics;
+        let [right, down] = columns;
+        self.camera.intrinsics = IntrinsicsNorm { fx, fy, cx, cy };
+        let turn = DMat3::from_cols_array(&[right[0], right[1], 0.0, down[0], down[1], 0.0, 0.0, 0.0, 1.0]);
+        self.camera.c2w.rotation *= turn;
+        self.view_turn = orientation;
     }
+
+    /// Returns whether stored pixels have the aspect ratio of the camera.
+    fn fits(&self, [width, height]: [usize; 2]) -> bool {
+        let shape = width as f64 / height as f64;
+        self.shape.is_none_or(|expected| (shape / expected - 1.0).abs() <= MAX_SHAPE_ERROR)
+    }
+
+    /// Decides how the EXIF orientation `tag` is used, by the aspect ratio of the camera.
+    fn turn(&self, stored: [usize; 2], tag: Orientation) -> Result<Turn, DataError> {
+        let [width, height] = stored;
+        let is_tagged = tag != Orientation::NoTransforms;
+        let (fits_stored, fits_turned) =
+            (self.fits(stored), is_tagged && self.fits(if exchanges(tag) { [height, width] } else { stored }));
+        if !fits_stored && !fits_turned {
+            let camera_aspect = self.shape.unwrap_or_default();
+            return Err(DataError::WrongAspect { width, height, camera_aspect, path: self.path.clone() });
+        }
+        let turns_pixels = fits_turned && (!fits_stored || self.poses_from == PosesFrom::Turned);
+        let is_rotation = matches!(tag, Orientation::Rotate90 | Orientation::Rotate180 | Orientation::Rotate270);
+        let none = Orientation::NoTransforms;
+        Ok(Turn {
+            pixels: if turns_pixels { tag } else { none },
+            view: if !turns_pixels && is_rotation { tag } else { none },
+            is_undecided: fits_stored && fits_turned && is_rotation,
+            is_unused: is_tagged && !turns_pixels && !is_rotation,
+        })
+    }
+}
+
+/// Returns whether an orientation exchanges columns and rows.
+fn exchanges(orientation: Orientation) -> bool {
+    orientation.to_exif() >= 5
 }
 
 /// Returns the number at the end of a file name: 12 for `frame_00012.png`.
@@ -166,15 +253,26 @@ impl PhotoScene {
         self.missing.push(MissingPhoto { name: name.into(), reason: reason.into() });
     }
 
+    /// Returns the names of the frames: the paths of the images below the folder that holds all of them, with `/`.
+    pub fn names(&self) -> Vec<String> {
+        let mut common = self.photos.first().and_then(|photo| photo.path.parent()).unwrap_or(Path::new(""));
+        while let Some(parent) = common.parent()
+            && !self.photos.iter().all(|photo| photo.path.starts_with(common))
+        {
+            common = parent;
+        }
+        let name = |photo: &Photo| {
+            let below = photo.path.strip_prefix(common).unwrap_or(&photo.path);
+            let parts: Vec<_> = below.iter().map(|part| decode_name(part.as_encoded_bytes())).collect();
+            parts.join("/")
+        };
+        self.photos.iter().map(name).collect()
+    }
+
     /// Returns time stamps that increase from frame to frame; frame indices if the names have none.
     pub fn timestamps(&self) -> Vec<i64> {
         let times: Option<Vec<i64>> = self.photos.iter().map(|photo| photo.time).collect();
         let times = times.filter(|times| times.is_sorted_by(|a, b| a < b));
         times.unwrap_or_else(|| (0..self.photos.len() as i64).collect())
-    }
-
-    /// Returns a function that wraps the error of a frame of the camera file at `path`.
-    pub fn in_frame(path: &Path, name: &str) -> impl FnOnce(DataError) -> DataError {
-        move |error| DataError::BadScene { what: format!("frame {name}: {error}"), path: path.to_owned() }
     }
 }

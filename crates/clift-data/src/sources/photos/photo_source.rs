@@ -3,11 +3,13 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
-use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
+use clift_core::{Camera, DVec3, IntrinsicsNorm, RgbImage, widest_fov_deg};
+use image::metadata::Orientation;
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::scene_source::SceneSource;
+use crate::geometry::path_spread::far_cameras;
+use crate::scene_source::{SceneSource, is_held_out};
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::find_by_name;
@@ -21,12 +23,20 @@ const MAX_CACHED_SCENES: usize = 256;
 /// Largest number of frames named in the report; further frames are counted.
 const MAX_NAMED_FRAMES: usize = 10_000;
 
+const FAR: &str = "whose camera is farther from all others than 20 times the median step";
+
 /// Images that a note counts.
-const COUNTED: [&str; 3] = [
+const COUNTED: [&str; 5] = [
     "without a camera, not used",
     "turned by the EXIF orientation, as the size of the cameras requires",
-    "with an EXIF orientation that is not applied, as the cameras have the stored size",
+    "turned with their cameras by the EXIF orientation",
+    "with an EXIF orientation that fits the cameras both ways; data.files.poses_from names the pixels of the poses",
+    "with an EXIF orientation that is not applied, as it mirrors",
 ];
+
+/// Largest number of scenes, and of bytes of the images of a scene, whose JPEG files are read to find damage.
+const MAX_CHECKED_SCENES: usize = 16;
+const MAX_CHECKED_BYTES: u64 = 512 << 20;
 
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoSourceOptions {
@@ -56,6 +66,8 @@ struct Entry {
     num_frames: usize,
     /// Indices of unusable images among the images found.
     unusable: Vec<usize>,
+    /// Orientations by which images are turned with their cameras, by index.
+    turns: Vec<(usize, Orientation)>,
 }
 
 /// Result of examining a scene at opening.
@@ -63,6 +75,7 @@ struct Entry {
 struct Findings {
     num_frames: usize,
     unusable: Vec<usize>,
+    turns: Vec<(usize, Orientation)>,
     missing: Vec<MissingPhoto>,
     /// Numbers of images, as in [`COUNTED`].
     counts: [usize; COUNTED.len()],
@@ -76,7 +89,8 @@ impl PhotoSource {
     /// with `whole_scenes`, only of the first image of a scene.
     pub fn open(folders: Vec<SceneFolder>, options: &PhotoSourceOptions) -> Result<Self, DataError> {
         options.filters.validate()?;
-        let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options)).collect();
+        let checks_data = !options.whole_scenes && folders.len() <= MAX_CHECKED_SCENES;
+        let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options, checks_data)).collect();
         let mut report = SkipReport::new(folders.len());
         let (mut scenes, mut first_error, mut num_unnamed) = (Vec::new(), None, 0);
         let mut counted: [(usize, Vec<String>); COUNTED.len()] = Default::default();
@@ -84,7 +98,7 @@ impl PhotoSource {
             let failed =
                 |error: DataError| Findings { reason: Some((error.to_string(), Some(error))), ..Findings::default() };
             let findings = findings.unwrap_or_else(failed);
-            let Findings { num_frames, unusable, missing, counts, notes, reason } = findings;
+            let Findings { num_frames, unusable, turns, missing, counts, notes, reason } = findings;
             let has_photos = num_frames > 0;
             if let Some((reason, error)) = reason {
                 report.skip(&folder.key, reason);
@@ -95,7 +109,7 @@ impl PhotoSource {
                     *total += count;
                     scenes.extend((count > 0).then(|| format!("{count} of {}", folder.key)));
                 }
-                scenes.push(Entry { folder: folder.clone(), num_frames, unusable });
+                scenes.push(Entry { folder: folder.clone(), num_frames, unusable, turns });
             }
             // Without any image, the reason of the scene covers all frames.
             for MissingPhoto { name, reason } in missing.into_iter().filter(|_| has_photos) {
@@ -137,6 +151,9 @@ impl PhotoSource {
             }
         }
         let mut read = entry.folder.read(&self.options)?;
+        for (position, orientation) in &entry.turns {
+            read.photos.get_mut(*position).into_iter().for_each(|photo| photo.turn_view(*orientation));
+        }
         let mut positions = 0..;
         read.photos
             .retain(|_| positions.next().is_some_and(|position| entry.unusable.binary_search(&position).is_err()));
@@ -165,31 +182,58 @@ impl PhotoSource {
     }
 }
 
-fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Findings, DataError> {
-    let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = folder.read(&options.photos)?;
+fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool) -> Result<Findings, DataError> {
+    let scene = folder.read(&options.photos)?;
+    let names = scene.names();
+    let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = scene;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
-    let (mut num_turned, mut num_unturned) = (0, 0);
+    let (mut turns, mut counts) = (Vec::new(), [num_without_camera, 0, 0, 0, 0]);
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
-    for (position, photo) in photos.iter().enumerate().take(num_checked) {
-        match photo.header() {
-            Ok(PhotoHeader { size: [width, height], is_turned, has_unused_orientation }) => {
+    let num_bytes = |photo: &Photo| std::fs::metadata(&photo.path).map_or(0, |metadata| metadata.len());
+    let checks_data = checks_data && photos.iter().map(num_bytes).sum::<u64>() <= MAX_CHECKED_BYTES;
+    let check = |photo: &Photo| {
+        let header = photo.header()?;
+        if checks_data { photo.check_data().map(|()| header) } else { Ok(header) }
+    };
+    let headers: Vec<_> = photos.par_iter().take(num_checked).map(check).collect();
+    for (position, header) in headers.into_iter().enumerate() {
+        match header {
+            Ok(PhotoHeader { size: [width, height], turn }) => {
                 is_small |= width < options.min_size[0] || height < options.min_size[1];
-                num_turned += usize::from(is_turned);
-                num_unturned += usize::from(has_unused_orientation);
+                let turns_view = turn.view != Orientation::NoTransforms;
+                let turns_pixels = turn.pixels != Orientation::NoTransforms;
+                turns.extend(turns_view.then_some((position, turn.view)));
+                let is_counted =
+                    [turns_pixels && !turn.is_undecided, turns_view && !turn.is_undecided, turn.is_undecided];
+                let is_counted = is_counted.into_iter().chain([turn.is_unused]);
+                counts[1..]
+                    .iter_mut()
+                    .zip(is_counted)
+                    .for_each(|(count, is_counted)| *count += usize::from(is_counted));
             }
             Err(error) => {
-                let name = photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let reason = match &error {
                     DataError::WrongAspect { .. } => "whose image has another aspect ratio than its camera",
                     DataError::TruncatedImage { .. } => "whose image is truncated",
+                    DataError::DamagedImage { .. } => "whose image is damaged",
                     _ => "whose image cannot be read",
                 };
-                missing.push(MissingPhoto { name, reason: reason.into() });
+                missing.push(MissingPhoto { name: names[position].clone(), reason: reason.into() });
                 unusable.push(position);
                 first_error.get_or_insert(error);
             }
         }
+    }
+    if !options.whole_scenes {
+        let centres: Vec<DVec3> = photos.iter().map(|photo| photo.camera.c2w.translation).collect();
+        for position in
+            far_cameras(&centres).into_iter().filter(|position| !unusable.contains(position)).collect::<Vec<_>>()
+        {
+            missing.push(MissingPhoto { name: names[position].clone(), reason: FAR.into() });
+            unusable.push(position);
+        }
+        unusable.sort_unstable();
     }
     let num_frames = photos.len() - unusable.len();
     let reason = if num_frames == 0 {
@@ -199,7 +243,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
             let what = match example {
                 None => "no frames listed".into(),
                 Some(MissingPhoto { name, .. }) if without_image => {
-                    format!("none of {num_listed} frames has an image; the first is {name}; data.files.image_folder names another folder of images")
+                    format!("none of {num_listed} frames has an image; the first is {name}; {}", folder.image_hint())
                 }
                 Some(MissingPhoto { name, reason }) => {
                     format!("none of {num_listed} frames is usable; {name} is a frame {reason}")
@@ -225,8 +269,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
     };
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
-    let counts = [num_without_camera, num_turned, num_unturned];
-    Ok(Findings { num_frames, unusable, missing, counts, notes, reason })
+    Ok(Findings { num_frames, unusable, turns, missing, counts, notes, reason })
 }
 
 impl SceneSource for PhotoSource {
@@ -267,7 +310,7 @@ impl SceneSource for PhotoSource {
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
-        if photo.undistortion.is_some() || photo.header()?.is_turned {
+        if photo.undistortion.is_some() || photo.header()?.turn.is_any() {
             return Ok(None);
         }
         photo.read().map(Some)
@@ -278,7 +321,16 @@ impl SceneSource for PhotoSource {
     }
 
     fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
-        let name = |photo: &Photo| photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(self.scene(scene)?.photos.iter().map(name).collect())
+        Ok(self.scene(scene)?.names())
+    }
+
+    fn held_out(&self, scene: usize, every: usize) -> Result<Vec<usize>, DataError> {
+        let photos = self.scene(scene)?;
+        let is_listed = every > 0 && photos.photos.iter().any(|photo| photo.is_held_out.is_some());
+        let is_held_out = |(frame, photo): (usize, &Photo)| {
+            if is_listed { photo.is_held_out.unwrap_or_default() } else { is_held_out(frame, every) }
+        };
+        let frames = photos.photos.iter().enumerate().filter(|frame| is_held_out(*frame));
+        Ok(frames.map(|(frame, _)| frame).collect())
     }
 }

@@ -1,14 +1,14 @@
 //! RealEstate10K as published: one text file of cameras per clip; the frames are extracted by the user.
 
-use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use clift_core::{Camera, IntrinsicsNorm};
 
 use crate::error::DataError;
 use crate::files::bounded::{read_bounded, read_start};
-use crate::sources::photos::image_folder::numbered_images;
-use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene};
+use crate::skip_report::plural;
+use crate::sources::photos::image_folder::{images_in, numbered_images};
+use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene, unusable};
 
 /// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
@@ -16,51 +16,88 @@ const MAX_URL_CHARS: usize = 1000;
 /// Number of columns of a line: a time stamp, four intrinsics, two zeros and a pose of 3 x 4.
 const NUM_COLUMNS: usize = 19;
 
-/// Reads the cameras of a clip and locates the frames, which are named by time stamp. Frames are in the order of the file.
+/// Reads the cameras of a clip and locates the frames, which are named by time stamp or are as many as the cameras. Frames
+/// are in the order of the file.
 pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, DataError> {
-    let images = if frames.is_dir() { numbered_images(frames)? } else { HashMap::new() };
+    let images = if frames.is_dir() { images_in(frames)? } else { Vec::new() };
+    let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
-    let text = String::from_utf8(text)
-        .map_err(|_| DataError::BadScene { what: "the file is not UTF-8".into(), path: path.to_owned() })?;
-    parse(text.trim_start_matches('\u{feff}'), &images)
-        .map_err(|what| DataError::BadScene { what, path: path.to_owned() })
+    let text = String::from_utf8(text).map_err(|_| bad("the file is not UTF-8".into()))?;
+    let (url, lines) = parse(text.trim_start_matches('\u{feff}')).map_err(bad)?;
+    let times: Vec<i64> = lines.iter().map(|(time, _)| *time).collect();
+    let (found, note) = locate(&times, &images);
+    let mut scene = PhotoScene { url, ..PhotoScene::default() };
+    scene.notes.extend(note.map(|note| format!("frames of {}: {note}", path.display())));
+    for ((time, camera), image) in lines.into_iter().zip(found) {
+        match (image, camera) {
+            (Some(path), Ok(camera)) => {
+                scene.photos.push(Photo { time: Some(time), ..Photo::pinhole(path.clone(), camera) });
+            }
+            (Some(_), Err(what)) => scene.skip(time.to_string(), unusable(&what)),
+            (None, _) => scene.skip(time.to_string(), NO_IMAGE),
+        }
+    }
+    // Time stamps increase, so that no image is counted twice.
+    scene.num_without_camera = images.len().saturating_sub(scene.photos.len());
+    Ok(scene)
 }
 
-fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, String> {
-    let mut scene = PhotoScene::default();
-    let mut last = i64::MIN;
+/// Finds the image of every time stamp, with a note if the names are not the time stamps.
+fn locate<'a>(times: &[i64], images: &'a [PathBuf]) -> (Vec<Option<&'a PathBuf>>, Option<String>) {
+    let numbered = numbered_images(images);
+    let exact: Vec<_> = times.iter().map(|time| numbered.get(time).copied()).collect();
+    let num_exact = exact.iter().flatten().count();
+    if num_exact == times.len().min(numbered.len()) && num_exact > 1 {
+        return (exact, None);
+    }
+    // Half the smallest distance of frames: no two frames are nearest to one image.
+    let step = times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).min().unwrap_or_default();
+    let nearest = |time: &i64| {
+        let range = time.saturating_sub((step - 1) / 2)..=time.saturating_add((step - 1) / 2);
+        numbered.range(range).min_by_key(|(number, _)| number.abs_diff(*time)).map(|(_, path)| *path)
+    };
+    let near: Vec<_> = times.iter().map(|time| numbered.get(time).copied().or_else(|| nearest(time))).collect();
+    let num_near = near.iter().flatten().count();
+    if images.len() == times.len() && num_near <= times.len() / 2 {
+        return (images.iter().map(Some).collect(), Some("the images are taken in the order of their names".into()));
+    }
+    let note = format!(
+        "the names of {} differ from the time stamps, by less than half a frame",
+        plural(num_near - num_exact, "image")
+    );
+    (near, (num_near > num_exact).then_some(note))
+}
+
+/// A time stamp with its camera, or why the camera cannot be used.
+type Line = (i64, Result<Camera<IntrinsicsNorm>, String>);
+
+/// Returns the URL and the cameras.
+fn parse(text: &str) -> Result<(String, Vec<Line>), String> {
+    let (mut url, mut lines) = (String::new(), Vec::<Line>::new());
     for (number, line) in text.lines().enumerate() {
         // The first line is the URL of the video; some tools omit it.
         let is_url = number == 0 && line.split_ascii_whitespace().count() < NUM_COLUMNS;
         if is_url {
-            scene.url = line.trim().chars().take(MAX_URL_CHARS).collect();
+            url = line.trim().chars().take(MAX_URL_CHARS).collect();
         }
         if line.trim().is_empty() || is_url {
             continue;
         }
         let in_line = |what: String| format!("line {}: {what}", number + 1);
         let (time, camera) = parse_line(line).map_err(in_line)?;
-        if time <= last {
+        if let Some((last, _)) = lines.last().filter(|(last, _)| time <= *last) {
             return Err(in_line(format!("the time stamp {time} does not exceed the previous one, {last}")));
         }
-        last = time;
-        if scene.photos.len() + scene.missing.len() == MAX_FRAMES {
+        if lines.len() == MAX_FRAMES {
             return Err(in_line(format!("more than {MAX_FRAMES} frames")));
         }
-        match images.get(&time) {
-            Some(path) => {
-                let (path, time) = (path.clone(), Some(time));
-                scene.photos.push(Photo { path, camera, undistortion: None, shape: None, time });
-            }
-            None => scene.skip(time.to_string(), NO_IMAGE),
-        }
+        lines.push((time, camera));
     }
-    // Time stamps increase, so that no image is counted twice.
-    scene.num_without_camera = images.len() - scene.photos.len();
-    Ok(scene)
+    Ok((url, lines))
 }
 
-fn parse_line(line: &str) -> Result<(i64, Camera<IntrinsicsNorm>), String> {
+/// Parses a line of the right form; words that are no numbers make the camera unusable.
+fn parse_line(line: &str) -> Result<Line, String> {
     let words: Vec<&str> = line.split_ascii_whitespace().take(NUM_COLUMNS + 1).collect();
     if words.len() != NUM_COLUMNS {
         let more = if words.len() > NUM_COLUMNS { "more" } else { &words.len().to_string() };
@@ -69,13 +106,13 @@ fn parse_line(line: &str) -> Result<(i64, Camera<IntrinsicsNorm>), String> {
     let time = words[0].parse().map_err(|_| format!("the time stamp is {:?}, expected a whole number", words[0]))?;
     let mut row = [0.0; 18];
     for (value, word) in row.iter_mut().zip(&words[1..]) {
-        *value = word.parse().map_err(|_| format!("expected a number, got {word:?}"))?;
+        *value = word.parse().unwrap_or(f64::NAN);
     }
-    Camera::from_re10k(row).map(|camera| (time, camera)).map_err(|error| error.to_string())
+    Ok((time, Camera::from_re10k(row).map_err(|error| error.to_string())))
 }
 
 /// Returns whether the first or second line of a text file is a camera of RealEstate10K.
 pub(crate) fn looks_like_re10k(path: &Path) -> bool {
     let Some(start) = read_start(path, 4096) else { return false };
-    String::from_utf8_lossy(&start).lines().take(2).any(|line| parse_line(line).is_ok())
+    String::from_utf8_lossy(&start).lines().take(2).any(|line| parse_line(line).is_ok_and(|(_, camera)| camera.is_ok()))
 }

@@ -8,7 +8,7 @@ use crate::files::listing::{file_names, has_ending};
 use crate::skip_report::{first_few, plural};
 use crate::sources::keys::{is_dl3dv_key, last_name};
 use crate::sources::photos::colmap::reader::{find_model, read_colmap};
-use crate::sources::photos::image_folder::numbered_images;
+use crate::sources::photos::image_folder::images_in;
 use crate::sources::photos::nerfstudio::read_transforms;
 use crate::sources::photos::photo::{PhotoOptions, PhotoScene};
 use crate::sources::photos::re10k_text::{looks_like_re10k, read_re10k_text};
@@ -41,10 +41,23 @@ pub(crate) struct SceneFolder {
 
 impl SceneFolder {
     pub fn read(&self, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
-        match &self.files {
+        let mut scene = match &self.files {
             SceneFiles::Transforms(path) => read_transforms(path, options),
             SceneFiles::Colmap { folder, model } => read_colmap(folder, model, options),
             SceneFiles::Re10kText { cameras, frames } => read_re10k_text(cameras, frames),
+        }?;
+        scene.photos.iter_mut().for_each(|photo| photo.poses_from = options.poses_from);
+        Ok(scene)
+    }
+
+    /// Returns what to do about a scene without any image.
+    pub fn image_hint(&self) -> &'static str {
+        match self.files {
+            SceneFiles::Re10kText { .. } => {
+                "name frames by time stamp, such as 52553000.png, or extract one for every line of the cameras; \
+                 data.files.frames names another folder of frames"
+            }
+            _ => "data.files.image_folder names another folder of images",
         }
     }
 
@@ -91,10 +104,11 @@ fn re10k_in(folder: &Path) -> Option<SceneFiles> {
     }
     let below = names.iter().map(|name| folder.join(name)).filter(|path| path.is_dir());
     let mut folders = std::iter::once(folder.to_owned()).chain(below);
-    let frames = folders.find(|frames| numbered_images(frames).is_ok_and(|images| !images.is_empty()))?;
+    let frames = folders.find(|frames| images_in(frames).is_ok_and(|images| !images.is_empty()))?;
     Some(SceneFiles::Re10kText { cameras, frames })
 }
 
+#[derive(Default)]
 pub(crate) struct FoundScenes {
     /// Scenes sorted by key: the name of the scene folder, or its path if several folders have that name.
     pub scenes: Vec<SceneFolder>,
@@ -102,6 +116,8 @@ pub(crate) struct FoundScenes {
     pub others: Vec<String>,
     /// Notes on links and duplicates.
     pub notes: Vec<String>,
+    /// Keys of scene folders without cameras: DL3DV scenes by their names, and folders with a folder of images.
+    pub without_cameras: Vec<String>,
 }
 
 /// Finds the scenes in `base` and below it. A folder that is reachable by several paths has the path without links, or
@@ -110,10 +126,10 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     if let Some(files) = scene_in(base) {
         let absolute = base.canonicalize().unwrap_or_else(|_| base.to_owned());
         let scenes = vec![SceneFolder { key: name_of(&absolute), files }];
-        return Ok(FoundScenes { scenes, others: Vec::new(), notes: Vec::new() });
+        return Ok(FoundScenes { scenes, ..FoundScenes::default() });
     }
     let mut found: Vec<(String, SceneFiles)> = Vec::new();
-    let (mut others, mut duplicates) = (Vec::new(), Vec::new());
+    let (mut others, mut duplicates, mut without_cameras) = (Vec::new(), Vec::new(), Vec::new());
     // Visited folders by canonical path, with the index in `found` if the folder is a scene.
     let mut seen: HashMap<PathBuf, Option<usize>> = HashMap::new();
     seen.extend(base.canonicalize().map(|base| (base, None)));
@@ -143,12 +159,17 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
         }
         if let Some(kind) = other_data_in(&path) {
             others.push(format!("{way} ({kind})"));
+        } else if (is_dl3dv_key(&way) || path.join("images").is_dir())
+            && !without_cameras.iter().any(|above| way.starts_with(&format!("{above}/")))
+        {
+            without_cameras.push(way.clone());
         }
         if way.split('/').count() < MAX_DEPTH {
             // Folders without read permission are ignored.
             push_folders(&path, &way, &mut folders, &mut links).unwrap_or_default();
         }
     }
+    without_cameras.retain(|way| !found.iter().any(|(scene, _)| scene.starts_with(&format!("{way}/"))));
     let mut notes = Vec::new();
     if !duplicates.is_empty() {
         let links = plural(duplicates.len(), "link");
@@ -170,7 +191,7 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     let mut scenes: Vec<_> = scenes.map(|((_, files), key)| SceneFolder { key, files }).collect();
     scenes.sort_by(|a, b| a.key.cmp(&b.key));
     others.sort_unstable();
-    Ok(FoundScenes { scenes, others, notes })
+    Ok(FoundScenes { scenes, others, notes, without_cameras })
 }
 
 /// Appends the paths of the subfolders of `folder`, in order of their names, links separately.

@@ -157,7 +157,7 @@ fn scenes_of_failing_chunks_are_skipped_with_the_error() {
 }
 
 #[test]
-fn unreadable_cameras_are_skipped_by_the_field_of_view() {
+fn frames_whose_cameras_cannot_be_used_are_skipped() {
     let folder = tempfile::tempdir().unwrap();
     let source = re10k_mini(Split::Train);
     let records = (0..2).map(|scene| {
@@ -170,11 +170,107 @@ fn unreadable_cameras_are_skipped_by_the_field_of_view() {
         Ok(SceneRecord { key, url: String::new(), timestamps, cameras, images })
     });
     write_chunks(&folder.path().join("train"), records, u64::MAX).unwrap();
-    let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(100.0) };
-    let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
-    assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a2"));
-    let skip = &source.report.skips[0];
-    assert!(skip.key == "00000000000000a1" && skip.reason.contains("frame 3: bad camera: "), "{skip:?}");
+    let whole = source;
+    for max_fov_deg in [None, Some(100.0)] {
+        let filters = SceneFilters { min_frames: 1, max_fov_deg };
+        let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
+        let scene = source.find("00000000000000a1").unwrap();
+        assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 7));
+        let [skip] = &source.report.frames[..] else { panic!("{}", source.report) };
+        assert!(skip.frame == "3" && skip.reason.starts_with("whose camera cannot be used: bad camera: "), "{skip:?}");
+        let kept = [0, 1, 2, 4, 5, 6, 7];
+        assert_eq!(source.timestamps(scene).unwrap(), kept.map(|frame| whole.timestamps(0).unwrap()[frame]));
+        assert_eq!(source.cameras(scene).unwrap()[3], whole.cameras(0).unwrap()[4]);
+        assert_eq!(source.frame(scene, 3).unwrap(), whole.frame(0, 4).unwrap());
+    }
+}
+
+/// A chunk of one scene of two frames, whose time stamps and further entry are raw opcodes.
+fn odd_chunk(timestamps: &[u8], extra: &[u8]) -> Vec<u8> {
+    let source = re10k_mini(Split::Train);
+    let mut pickle = PickleWriter::new();
+    pickle.raw(b"](}(");
+    pickle.string("key");
+    pickle.string("a");
+    pickle.raw(extra);
+    pickle.raw(timestamps);
+    pickle.string("cameras");
+    let rows: Vec<u8> = source.cameras(0).unwrap()[..2]
+        .iter()
+        .flat_map(|camera| camera.to_re10k().map(|value| (value as f32).to_le_bytes()))
+        .flatten()
+        .collect();
+    pickle.tensor("FloatStorage", rows, &[2, 18]);
+    pickle.string("images");
+    pickle.raw(b"](");
+    for frame in 0..2 {
+        let image = source.encoded_frame(0, frame).unwrap().unwrap();
+        let length = image.len();
+        pickle.tensor("ByteStorage", image, &[length]);
+    }
+    pickle.raw(b"eue.");
+    pickle.pack("odd").unwrap()
+}
+
+#[test]
+fn unused_entries_of_any_kind_are_skipped_and_time_stamps_may_be_missing() {
+    let tensor = |storage_type: &str, bytes: usize| {
+        let mut writer = PickleWriter::new();
+        writer.tensor(storage_type, vec![0; bytes], &[2]);
+        writer.pickle()[2..].to_vec()
+    };
+    let entry =
+        |name: &str, value: &[u8]| [b"X", &(name.len() as u32).to_le_bytes()[..], name.as_bytes(), value].concat();
+    let numpy = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85c_codecs\nencode\nX\x01\0\0\0bX\x06\0\0\0latin1\x86R\x87R\
+        (K\x01K\x02\x85cnumpy\ndtype\nX\x02\0\0\0f4\x89\x88\x87R(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89C\x02xytb";
+    let plain = entry("timestamps", &tensor("LongStorage", 16));
+    for (what, timestamps, extra, has_times) in [
+        ("int64", plain.clone(), Vec::new(), true),
+        ("int32", entry("timestamps", &tensor("IntStorage", 8)), Vec::new(), false),
+        ("float", entry("timestamps", &tensor("FloatStorage", 8)), Vec::new(), false),
+        ("half", entry("timestamps", &tensor("HalfStorage", 4)), Vec::new(), false),
+        ("list", entry("timestamps", b"](K\x01K\x02e"), Vec::new(), false),
+        ("absent", Vec::new(), Vec::new(), false),
+        ("numpy array", plain.clone(), entry("depth", numpy), true),
+        ("bool tensor", plain.clone(), entry("mask", &tensor("BoolStorage", 2)), true),
+        ("bf16 tensor", plain.clone(), entry("x", &tensor("BFloat16Storage", 4)), true),
+        ("torch.Size", plain.clone(), entry("size", b"ctorch\nSize\n(K\x04K\x05t\x85R"), true),
+        ("bytes", plain.clone(), entry("raw", b"C\x03abc"), true),
+        ("set", plain.clone(), entry("set", b"\x8f(K\x01K\x02\x90"), true),
+        ("Path", plain.clone(), entry("path", b"cpathlib\nPosixPath\nX\x01\0\0\0a\x85R"), true),
+    ] {
+        let (folder, _) = with_chunk(&odd_chunk(&timestamps, &extra), &["a"]);
+        let filters = SceneFilters { min_frames: 2, ..ALL };
+        let source =
+            ChunkSource::open(folder.path(), Split::Train, &filters).unwrap_or_else(|error| panic!("{what}: {error}"));
+        assert_eq!(source.timestamps(0).unwrap() != [0, 1], has_times, "{what}");
+        assert!(source.frame(0, 1).is_ok() && source.cameras(0).is_ok(), "{what}");
+        let note = "1 scene without time stamps as int64, which are counted 0, 1, .. (a)";
+        assert_eq!(source.report.notes.iter().any(|got| got == note), !has_times, "{what}: {}", source.report);
+    }
+    for (module, name) in [("os", "system"), ("builtins", "eval"), ("subprocess", "Popen")] {
+        let call = [format!("c{module}\n{name}\n").as_bytes(), b"X\x02\0\0\0ls\x85R"].concat();
+        let (_folder, source) = with_chunk(&odd_chunk(&plain, &entry("x", &call)), &["a"]);
+        let message = source.num_frames(0).unwrap_err().to_string();
+        assert!(message.contains(&format!("`{module}.{name}`")) && message.contains("no code was run"), "{message}");
+    }
+}
+
+#[test]
+fn chunks_without_checksums_are_read_with_a_note() {
+    let mut bytes = mini_chunk();
+    // Local headers have the checksum at byte 14, those of the directory at byte 16.
+    for (signature, at) in [(b"PK\x03\x04", 14), (b"PK\x01\x02", 16)] {
+        let starts: Vec<usize> = (0..bytes.len() - 4).filter(|start| bytes[*start..].starts_with(signature)).collect();
+        for start in starts {
+            bytes[start + at..][..4].fill(0);
+        }
+    }
+    let (folder, source) = with_chunk(&bytes, &["00000000000000a1", "00000000000000a2"]);
+    assert_eq!(source.frame(0, 3).unwrap(), re10k_mini(Split::Train).frame(0, 3).unwrap());
+    let filters = SceneFilters { min_frames: 2, ..ALL };
+    let report = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap().report;
+    assert_eq!(report.notes, ["1 file without checksums: damage would not be noticed"]);
 }
 
 #[test]
@@ -194,7 +290,9 @@ fn sharing_chunk(scenes: &[u8]) -> Vec<u8> {
     let mut pickle = PickleWriter::new();
     pickle.tensor("ByteStorage", Vec::new(), &[0]);
     pickle.raw(&[b"q\x01](", b"h\x01".repeat(10_000).as_slice(), b"eq\x02"].concat());
-    pickle.tensor("FloatStorage", vec![0; 720_000], &[10_000, 18]);
+    let row =
+        Camera::to_re10k(&re10k_mini(Split::Train).cameras(0).unwrap()[0]).map(|value| (value as f32).to_le_bytes());
+    pickle.tensor("FloatStorage", row.concat().repeat(10_000), &[10_000, 18]);
     pickle.raw(b"q\x03");
     pickle.tensor("LongStorage", vec![0; 80_000], &[10_000]);
     pickle.raw(&[b"q\x04](", scenes, b"e."].concat());

@@ -6,6 +6,7 @@ use std::io::{BufReader, Read};
 use std::path::Path;
 
 use crate::error::DataError;
+use crate::files::listing::decode_name;
 use crate::sources::photos::colmap::model::{
     ColmapCamera, ColmapImage, MAX_NAME_BYTES, MODELS, Model, add_camera, add_image,
 };
@@ -53,6 +54,11 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
         add_image(&mut images, ColmapImage { name, camera_id, w2c }).map_err(|what| file.bad(what))?;
     }
     Ok(images)
+}
+
+/// Reads the number of images of `images.bin`; 0 for an unreadable file.
+pub(crate) fn num_images(path: &Path) -> u64 {
+    Fields::open(path).and_then(|mut file| file.take()).map(u64::from_le_bytes).unwrap_or_default()
 }
 
 /// Sequential fields of a file. Counts of the file reserve no memory.
@@ -103,7 +109,7 @@ impl<'a> Fields<'a> {
                 return Err(self.bad(format!("the name before byte {} is longer than {MAX_NAME_BYTES} bytes", self.at)));
             }
         }
-        String::from_utf8(name).map_err(|_| self.bad(format!("the name before byte {} is not UTF-8", self.at)))
+        Ok(decode_name(&name))
     }
 
     fn skip(&mut self, count: Option<u64>) -> Result<(), DataError> {

@@ -1,21 +1,64 @@
 //! Captures as COLMAP models: `cameras` and `images` as `.bin` or `.txt`, with an image folder. Points are ignored.
 
-use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::collections::VecDeque;
+use std::path::{Component, Path, PathBuf};
 
 use crate::error::DataError;
-use crate::files::listing::natural_order;
-use crate::skip_report::plural;
+use crate::files::listing::{file_names, natural_order};
 use crate::sources::photos::colmap::model::Model;
 use crate::sources::photos::colmap::{binary, text};
 use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::photo::{Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::image_locator::first_found;
+use crate::sources::photos::photo::{Photo, PhotoOptions, PhotoScene, unusable};
 
-/// Returns the folder of the COLMAP model of a scene: the scene folder, or one of the usual subfolders.
+/// Folders of a scene that hold models, directly or in [`MODEL_FOLDERS`].
+const BASES: [&str; 4] = ["sparse", "colmap", "dense", "distorted"];
+/// Names of folders between a base and its models, besides numbers: `dense/0/sparse`, `sparse/0/models/1`.
+const MODEL_FOLDERS: [&str; 4] = ["sparse", "models", "model", "dense"];
+const MAX_DEPTH: usize = 3;
+const MAX_MODELS: usize = 1000;
+
+/// Returns the folder of the COLMAP model of a scene: the scene folder, or the model with most images below the first
+/// of [`BASES`] that has one. COLMAP writes several models if it cannot connect all images.
 pub(crate) fn find_model(folder: &Path) -> Option<PathBuf> {
-    let subfolders = ["", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dense/sparse/0", "dense/sparse"];
-    let mut models = subfolders.into_iter().map(|name| if name.is_empty() { folder.into() } else { folder.join(name) });
-    models.find(|model| model_files(model).is_some())
+    if model_files(folder).is_some() {
+        return Some(folder.to_owned());
+    }
+    let models = BASES.iter().map(|base| models_below(&folder.join(base))).find(|models| !models.is_empty())?;
+    largest(models).map(|(model, _)| model)
+}
+
+/// Returns the models in a folder and below it, upper folders first.
+fn models_below(base: &Path) -> Vec<PathBuf> {
+    let (mut found, mut folders) = (Vec::new(), VecDeque::from([(base.to_owned(), 0)]));
+    while let Some((folder, depth)) = folders.pop_front() {
+        let mut names = if depth < MAX_DEPTH { file_names(&folder).unwrap_or_default() } else { Vec::new() };
+        names.retain(|name| name.bytes().all(|byte| byte.is_ascii_digit()) || MODEL_FOLDERS.contains(&name.as_str()));
+        names.sort_by(|a, b| natural_order(a, b));
+        folders.extend(names.iter().map(|name| (folder.join(name), depth + 1)));
+        if model_files(&folder).is_some() {
+            found.push(folder);
+        }
+        if found.len() + folders.len() > MAX_MODELS {
+            break;
+        }
+    }
+    found
+}
+
+/// Returns the model with most images, the first of several, and that number; a single model is not counted.
+fn largest(mut models: Vec<PathBuf>) -> Option<(PathBuf, u64)> {
+    if models.len() == 1 {
+        return models.pop().map(|model| (model, 0));
+    }
+    let num_images = |model: &Path| match model_files(model) {
+        Some(([_, images], true)) => binary::num_images(&images),
+        Some(([_, images], false)) => text::num_images(&images),
+        None => 0,
+    };
+    let counted = models.into_iter().map(|model| (num_images(&model), model));
+    let most = counted.reduce(|best, next| if next.0 > best.0 { next } else { best });
+    most.map(|(count, model)| (model, count))
 }
 
 /// Returns the two files of a model and whether they are binary; binary files take precedence.
@@ -34,42 +77,46 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
     };
     let read = if is_binary { binary::read } else { text::read };
     let Model { cameras, mut images } = read(&cameras_path, &images_path)?;
-    let mut optics = HashMap::with_capacity(cameras.len());
-    for (id, camera) in &cameras {
-        let bad =
-            |what: String| DataError::BadScene { what: format!("camera {id}: {what}"), path: cameras_path.clone() };
-        optics.insert(id, camera.optics().map_err(bad)?);
-    }
     images.sort_by(|a, b| natural_order(&a.name, &b.name));
     let mut folders = ImageFolders::default();
     let image_folder = find_image_folder(folder, model, options, &mut folders);
-    let mut scene = PhotoScene { notes: other_models(model), ..PhotoScene::default() };
+    let mut scene = PhotoScene { notes: other_models(folder, model), ..PhotoScene::default() };
     for (index, image) in images.iter().enumerate() {
         let found = match index.checked_sub(1).map(|before| &images[before].name) {
             Some(before) if *before == image.name => Err("with the image of another frame".into()),
-            _ => folders.find(&image_folder.join(&image.name)),
+            _ => first_found(&image.name, |name| find_image(&image_folder, name, &mut folders)),
         };
-        let path = match found {
-            Ok(path) => path,
-            Err(reason) => {
-                scene.skip(&image.name, reason);
-                continue;
-            }
-        };
-        let in_frame = |error| PhotoScene::in_frame(&images_path, &image.name)(error);
-        let Some((intrinsics_norm, lens)) = optics.get(&image.camera_id) else {
-            return Err(in_frame(DataError::bad_camera(format!("no camera {}", image.camera_id))));
-        };
-        let camera = &cameras[&image.camera_id];
-        let size = Some([camera.width as f64, camera.height as f64]);
-        let photo = image
-            .c2w()
-            .and_then(|c2w| Photo::new(path, c2w, *intrinsics_norm, size, (*lens, options.undistort)))
-            .map_err(in_frame)?;
-        scene.photos.push(photo);
+        let photo = found.and_then(|path| {
+            let camera = cameras.get(&image.camera_id);
+            let camera = camera.ok_or_else(|| unusable(&format!("no camera {}", image.camera_id)))?;
+            let optics = camera.optics().map_err(|what| unusable(&format!("camera {}: {what}", image.camera_id)));
+            let (intrinsics_norm, lens) = optics?;
+            let size = Some([camera.width as f64, camera.height as f64]);
+            let photo = |c2w| Photo::new(path, c2w, intrinsics_norm, size, (lens, options.undistort));
+            image.c2w().and_then(photo).map_err(|error| unusable(&error))
+        });
+        match photo {
+            Ok(photo) => scene.photos.push(photo),
+            Err(reason) => scene.skip(&image.name, reason),
+        }
     }
     scene.num_without_camera = folders.num_unrequested();
     Ok(scene)
+}
+
+/// Finds an image by its name in the model. Some tools write names with the image folder, `images/0.png`.
+fn find_image(image_folder: &Path, name: &str, folders: &mut ImageFolders) -> Result<PathBuf, String> {
+    let found = folders.find(&image_folder.join(name));
+    found.or_else(|error| {
+        let is_folder =
+            |part: &Component<'_>| part.as_os_str() == "images" || image_folder.file_name() == Some(part.as_os_str());
+        let below: PathBuf = Path::new(name).components().skip_while(|part| !is_folder(part)).skip(1).collect();
+        if below.as_os_str().is_empty() {
+            Err(error)
+        } else {
+            folders.find(&image_folder.join(below)).map_err(|_| error)
+        }
+    })
 }
 
 /// Returns the folder to which the image names are relative.
@@ -90,13 +137,16 @@ fn find_image_folder(folder: &Path, model: &Path, options: &PhotoOptions, folder
     })
 }
 
-/// Returns a note on models beside `sparse/0`: COLMAP writes several models if it cannot connect all images.
-fn other_models(model: &Path) -> Vec<String> {
-    if model.file_name().is_none_or(|name| name != "0") {
-        return Vec::new();
-    }
-    let others = (1..100).take_while(|number| model_files(&model.with_file_name(number.to_string())).is_some()).count();
-    let folder = model.parent().unwrap_or(model).display();
-    let note = || format!("{folder} has {}; only model 0 is used", plural(others, "more model"));
-    (others > 0).then(note).into_iter().collect()
+/// Returns a note on the choice among several models.
+fn other_models(folder: &Path, model: &Path) -> Vec<String> {
+    let models = BASES
+        .iter()
+        .map(|base| models_below(&folder.join(base)))
+        .find(|models| models.iter().any(|other| other == model));
+    let models = models.filter(|models| models.len() > 1).unwrap_or_default();
+    let counted = largest(models.clone()).map(|(_, count)| {
+        let name = model.strip_prefix(folder).unwrap_or(model).display();
+        format!("of {} models of {}, {name} with most images, {count}, is used", models.len(), folder.display())
+    });
+    counted.into_iter().collect()
 }

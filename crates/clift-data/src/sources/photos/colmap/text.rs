@@ -7,6 +7,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 use crate::error::DataError;
+use crate::files::listing::decode_name;
 use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
 
 /// Largest number of stored bytes of a line; lines of points may be longer, and their rest is skipped.
@@ -26,7 +27,8 @@ fn read_cameras(path: &Path) -> Result<HashMap<u32, ColmapCamera>, DataError> {
             let id = number(words.next(), "CAMERA_ID")?;
             let model = words.next().ok_or("no MODEL")?.to_owned();
             let (width, height) = (number(words.next(), "WIDTH")?, number(words.next(), "HEIGHT")?);
-            let params = words.map(|word| number(Some(word), "PARAMS")).collect::<Result<_, _>>()?;
+            // Programs write NaN in many ways, such as `-nan(ind)`: the camera is refused if an image uses it.
+            let params = words.map(|word| word.parse().unwrap_or(f64::NAN)).collect();
             add_camera(&mut cameras, id, ColmapCamera { model, width, height, params })
         })();
         camera.map_err(|what: String| lines.bad(&what))?;
@@ -40,14 +42,26 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
     while let Some(line) = lines.next_entry()? {
         let image = parse_image(&line).and_then(|image| add_image(&mut images, image));
         image.map_err(|what| lines.bad(&what))?;
-        // The line of points may be empty, but a camera or image line in its place is an error.
-        if lines.next_line()? && !lines.is_of_points() {
+        // The line of points may be empty, but an image line in its place is an error.
+        if lines.next_line()? && lines.is_of_image() {
             return Err(
                 lines.bad("expected the points of the image above: two lines per image, the second may be empty")
             );
         }
     }
     Ok(images)
+}
+
+/// Counts the images of `images.txt`; 0 for an unreadable file.
+pub(crate) fn num_images(path: &Path) -> u64 {
+    let count = || {
+        let (mut lines, mut count) = (Lines::open(path)?, 0);
+        while lines.next_entry()?.is_some() {
+            (count, _) = (count + 1, lines.next_line()?);
+        }
+        Ok::<u64, DataError>(count)
+    };
+    count().unwrap_or_default()
 }
 
 fn parse_image(line: &str) -> Result<ColmapImage, String> {
@@ -60,7 +74,7 @@ fn parse_image(line: &str) -> Result<ColmapImage, String> {
     let _: u32 = number(Some(&word("IMAGE_ID")?), "IMAGE_ID")?;
     let mut w2c = [0.0; 7];
     for (value, name) in w2c.iter_mut().zip(["QW", "QX", "QY", "QZ", "TX", "TY", "TZ"]) {
-        *value = number(Some(&word(name)?), name)?;
+        *value = word(name)?.parse().unwrap_or(f64::NAN);
     }
     let camera_id = number(Some(&word("CAMERA_ID")?), "CAMERA_ID")?;
     if rest.is_empty() || rest.len() > MAX_NAME_BYTES {
@@ -118,16 +132,13 @@ impl<'a> Lines<'a> {
             if self.line.len() == MAX_LINE_BYTES {
                 return Err(self.bad("the line is too long"));
             }
-            let text = std::str::from_utf8(line).map_err(|_| self.bad("the line is not UTF-8"))?;
-            return Ok(Some(text.to_owned()));
+            return Ok(Some(decode_name(line)));
         }
         Ok(None)
     }
 
-    /// Returns whether the first ten words are numbers, as in a line of points; the tenth word of an image line is a name.
-    fn is_of_points(&self) -> bool {
-        let words = self.line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-        let is_number = |word: &[u8]| std::str::from_utf8(word).is_ok_and(|word| word.parse::<f64>().is_ok());
-        words.take(10).all(is_number)
+    /// Returns whether this is the line of an image: the numbers of points do not form a unit quaternion.
+    fn is_of_image(&self) -> bool {
+        parse_image(&decode_name(&self.line)).is_ok_and(|image| image.c2w().is_ok())
     }
 }
