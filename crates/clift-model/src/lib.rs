@@ -125,4 +125,5 @@ pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
+pub use weights::shipped_model::{SHIPPED_MODEL, find_shipped, is_shipped};
 pub use weights::trained_model::{TrainedModel, open_renderer};

@@ -52,10 +52,7 @@ pub fn fit_token_codec(
         seed: derive_seed(config.seed, "codec"),
     };
     let mut progress = FitEvents { stop, sink };
-    let fitted = fit_codec(model, reader, &items, &options, &mut progress).map_err(|error| match error {
-        SceneError::Interrupted { .. } => TrainError::Abandoned { task: "fitting the token codec".into() },
-        error => error.into(),
-    })?;
+    let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
     fitted.codec.write(&TokenCodec::path_of(weights))?;
     Ok(fitted)
 }

@@ -10,7 +10,7 @@ use serde::Serialize;
 use toml::de::{DeTable, DeValue};
 
 use crate::config::diagnostic::SourceText;
-use crate::config::schema::{Sections, join, nearest, quoted_names};
+use crate::config::schema::{Sections, join, nearest, quoted_names, related_key};
 use crate::error::TrainError;
 
 /// Finds every unknown key, in the order of the text.
@@ -47,7 +47,7 @@ fn unknown_key(sections: &Sections, section: &str, name: &str, is_section: bool)
         Some(near) if is_table => format!("did you mean [{near}]?"),
         Some(near) if is_section || elsewhere.is_empty() => format!("did you mean `{near}`?"),
         _ if !elsewhere.is_empty() => format!("`{name}` belongs to {}", elsewhere.join(" or ")),
-        _ => String::new(),
+        _ => related_key(name, section, sections).map_or_else(String::new, |key| format!("did you mean `{key}`?")),
     };
     (title, label, format!("help: {} has {}", owner_of(section), quoted(keys)))
 }
@@ -173,7 +173,7 @@ fn describe_found(got: &str) -> String {
     match got.split_once(' ') {
         Some(("string", text)) => format!("the string {text}"),
         Some(("integer" | "floating", number)) => {
-            format!("the number {}", number.trim_start_matches("point ").trim_matches('`'))
+            format!("the number {}", number.split('`').nth(1).unwrap_or(number))
         }
         Some(("boolean", value)) => value.trim_matches('`').to_owned(),
         _ if got == "sequence" => "a list".to_owned(),

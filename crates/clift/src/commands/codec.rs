@@ -11,7 +11,7 @@ use clift_train::fit_token_codec;
 use crate::commands::args::model_args::ModelArgs;
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::output_file::OutputFile;
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::print_result;
@@ -47,7 +47,7 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
     let model = model_args.open()?;
     let frames = EvalFrames { split: EvalSplit::Train, hold_out };
     let mut sink = progress_sink();
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let fitted = fit_token_codec(config, (&model, &path.weights), (&reader, frames), &stop, sink.as_mut())?;
     drop(sink);
     print_result(&describe(&fitted, &out.display().to_string()))

@@ -12,7 +12,7 @@ use crate::commands::args::model_args::check_network;
 use crate::commands::args::parse::{parse_bytes, parse_split};
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::{print_evaluation, print_warning};
 
@@ -44,7 +44,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         );
     }
     let mut sink = progress_sink();
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let folder = EvalFolder::open(&out, args.force, sink.as_mut())?;
     let request = EvalRequest { split: args.split, external: &external, folder: &folder };
     let summary = match &model {

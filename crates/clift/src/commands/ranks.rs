@@ -4,7 +4,7 @@ use std::rc::Rc;
 
 use clift_train::{Launched, RankPlace, Ranks, TrainError};
 
-use crate::output::verbosity::Verbosity;
+use crate::verbosity::Verbosity;
 use crate::threads;
 
 /// Connects the processes of a launcher, and gives each its share of the cores. From now on only rank 0 prints.

@@ -9,7 +9,7 @@ use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, RunStep, Stage, St
 use crate::commands::args::parse::{parse_count, parse_training_step};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::ranks::{connect, finish};
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::{print_run, print_warning};
 
@@ -29,7 +29,7 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     if let Ok(Some(warning)) = memory_warning(&of_rank, available_bytes(config.device)) {
         print_warning(warning);
     }
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::RUN)?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();
     let (run_dir, supports_clusters) = (config.run_dir.clone(), config.model.architecture.supports_clusters());

@@ -6,11 +6,11 @@ use std::process::{Command, Stdio};
 
 use clift_data::{ClipReader, EvaluationItem, SkipReport, Split, ViewIndices};
 use clift_eval::{EvalFrames, evaluation_items};
-use clift_model::{DeviceName, ModelConfig};
+use clift_model::{DeviceName, ModelConfig, is_shipped};
 use clift_scene::{EncodeOptions, Scene, load_renderer, spread_contexts};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
-use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
+use crate::commands::args::model_args::{ModelArgs, default_model, is_data};
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::render::run::scene_weights;
@@ -51,8 +51,8 @@ pub struct ViewArgs {
 
 /// Serves scenes until the process ends.
 pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
-    let scene = args.scene.clone().map_or_else(shipped_model, Ok)?;
-    let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene);
+    let scene = args.scene.clone().unwrap_or_else(default_model);
+    let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene) || is_shipped(&scene);
     let (scenes, device) = if is_run { open_run(&scene, args)? } else { open_file(&scene, args)? };
     let server = ViewServer::bind((args.listen, args.port).into())?;
     let (url, port) = (server.url(), server.address().port());

@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::Context;
 use clift_eval::Summary;
 
-use crate::output::verbosity::Verbosity;
+use crate::verbosity::Verbosity;
 use crate::output::visible::visible;
 
 /// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is not an error.

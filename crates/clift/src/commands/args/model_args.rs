@@ -6,7 +6,7 @@ use clift_data::{
     DataError, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
     open_source,
 };
-use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
+use clift_model::{ModelConfig, ModelError, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
 use clift_scene::default_num_context;
 use clift_train::{Config, Override};
 
@@ -14,9 +14,6 @@ use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::output::counter::ScanCounter;
 use crate::output::stdout::{print_note, print_warning};
-
-/// The model that is used where none is named, trained on synthetic scenes.
-const SHIPPED_MODEL: &str = "models/rooms";
 
 /// Environment variable with the path of another model to use where none is named.
 const MODEL_VARIABLE: &str = "CLIFT_MODEL";
@@ -36,7 +33,7 @@ impl ModelArgs {
     /// Takes `RUN`, `RUN DIR`, or `DIR` alone with the shipped model.
     pub fn find(first: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
         if folder.is_none() && is_data(first) {
-            let shipped = shipped_model()?;
+            let shipped = default_model();
             print_note(&format!("model: {}", shipped.display()));
             return Self::new(&shipped, Some(first), args);
         }
@@ -45,7 +42,7 @@ impl ModelArgs {
 
     /// Reads the config of a model. The config of an imported model has no data.
     pub fn new(model: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
-        if !model.exists() {
+        if !model.exists() && !is_shipped(model) {
             usage_bail!("{}: no such file or folder", model.display());
         }
         let path = ModelPath::find(model)?;
@@ -119,22 +116,9 @@ pub fn is_data(path: &Path) -> bool {
     is_json || path.is_dir() && !path.join("config.toml").exists() && ModelPath::find(path).is_err()
 }
 
-/// Returns the model that ships with clift: that of `CLIFT_MODEL`, or `models/rooms` in the current folder or above the
-/// program.
-pub fn shipped_model() -> anyhow::Result<PathBuf> {
-    if let Some(model) = std::env::var_os(MODEL_VARIABLE) {
-        return Ok(model.into());
-    }
-    let program = std::env::current_exe().unwrap_or_default();
-    let places = std::iter::once(Path::new("")).chain(program.ancestors().skip(1));
-    let mut places = places.map(|place| place.join(SHIPPED_MODEL));
-    let Some(model) = places.find(|place| place.is_dir()) else {
-        usage_bail!(
-            "no run or model is named, and {SHIPPED_MODEL}, which ships with clift, is not found; run from the repository, \
-             or set {MODEL_VARIABLE} to its path"
-        )
-    };
-    Ok(model)
+/// Returns the model that is used where none is named: that of `CLIFT_MODEL`, or the one that ships with clift.
+pub fn default_model() -> PathBuf {
+    std::env::var_os(MODEL_VARIABLE).map_or_else(|| SHIPPED_MODEL.into(), PathBuf::from)
 }
 
 #[cfg(test)]

@@ -35,7 +35,7 @@ pub struct SourceArgs {
 impl SourceArgs {
     /// Returns the options of `--set` and what they changed.
     pub fn files(&self) -> anyhow::Result<(FileOptions, Vec<Override>)> {
-        let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set)?;
+        let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set, |_| Ok(()))?;
         Ok((keys.data.files, changes))
     }
 

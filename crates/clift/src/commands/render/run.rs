@@ -14,7 +14,7 @@ use serde::Serialize;
 use crate::commands::render::args::{CameraPath, RenderArgs};
 use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
@@ -69,7 +69,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     }
     let views = path_cameras(&scene, args, height, width)?;
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let opened = device.open()?;
     let precision = args.precision.unwrap_or_else(|| Precision::for_images(&opened));
     precision.check("--precision", &opened)?;
@@ -117,7 +117,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
 /// Returns the weight file of the scene that was read from `file`: that of `model`, or of the scene's own model.
 pub fn scene_weights(scene: &Scene, file: &Path, model: Option<&Path>) -> anyhow::Result<PathBuf> {
     let path = model.map_or_else(|| scene.find_model(file), Path::to_path_buf);
-    let weights = ModelPath::for_tokens(&path, scene.kind);
+    let weights = ModelPath::for_tokens(&path, scene.kind)?;
     if model.is_none() && !weights.exists() {
         // The path comes from an untrusted file: control characters must not reach the terminal.
         let path = weights.display().to_string();
