@@ -296,7 +296,8 @@ impl Place {
             lines.extend(self.json_lines(&format!("{run}/validation.jsonl")));
         }
         for line in &mut lines {
-            line.as_object_mut().expect("an object").retain(|key, _| key != "step_s" && key != "time");
+            let of_machine = ["step_s", "images_per_s", "peak_bytes", "time"];
+            line.as_object_mut().expect("an object").retain(|key, _| !of_machine.contains(&key.as_str()));
         }
         lines
     }

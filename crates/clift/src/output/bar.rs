@@ -5,7 +5,7 @@ use std::time::Duration;
 use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-use crate::output::event_line::{event_line, step_metrics, time_left};
+use crate::output::event_line::{event_line, image_rate, step_metrics, time_left};
 use crate::output::stdout::print_note;
 use crate::output::units::rate;
 use crate::output::visible::visible;
@@ -38,7 +38,7 @@ impl Sink for Bar {
                 self.bar = Some(progress_bar_to(*last_step_of_size, stage.name(), *done, *last_step));
             }
             (Event::Step(step), Some(bar)) => {
-                bar.set_message(step_metrics(step));
+                bar.set_message(format!("{}  {}", step_metrics(step), image_rate(step.images_per_s)));
                 bar.set_position(step.step);
             }
             (Event::Progress { done, .. }, Some(bar)) => bar.set_position(*done),
@@ -47,9 +47,9 @@ impl Sink for Bar {
     }
 }
 
-// Everything up to the message fits 80 columns. The message is cut at the end of the line: a wrapped bar would leave
-// copies of itself behind.
-const TEMPLATE: &str = "{prefix} {bar:16.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
+// Everything up to the loss fits 80 columns. The message is cut at the end of the line: a wrapped bar would leave copies of
+// itself behind.
+const TEMPLATE: &str = "{prefix} {bar:8.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
 
 pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
     progress_bar_to(total, name, done, total)
@@ -111,6 +111,6 @@ mod tests {
     fn no_time_left_before_the_first_step() {
         assert_eq!(pace(0.0, 0, 60, 100), "");
         assert_eq!(pace(0.125, 50, 60, 60), "  8.0 s each, 1 min 20 s left");
-        assert_eq!(pace(0.125, 50, 60, 100), "  8.0 s each, 1 min 20 s to step 60");
+        assert_eq!(pace(0.125, 50, 60, 100), "  8.0 s each, 1 min 20 s to 60");
     }
 }

@@ -4,7 +4,7 @@ use std::io::Write;
 
 use clift_train::{Event, Sink, StepEvent};
 
-use crate::output::event_line::{event_line, step_metrics, time_left};
+use crate::output::event_line::{event_line, image_rate, step_metrics, time_left};
 use crate::output::visible::visible;
 
 /// Seconds of training between two progress lines, unless every step is wanted.
@@ -38,7 +38,9 @@ impl<W: Write> PlainLines<W> {
         let StepEvent { step, last_step, last_step_of_size, .. } = *event;
         let left = time_left(mean_step_s * last_step_of_size.saturating_sub(step) as f64, last_step_of_size, last_step);
         let (name, width) = (event.stage.name(), last_step.to_string().len());
-        Some(format!("{name} {step:>width$}/{last_step}  {}  {mean_step_s:.3} s/step, {left}", step_metrics(event)))
+        // At most 80 columns, up to steps of five digits. The rate is that of the same steps.
+        let rate = image_rate(event.images_per_s * event.step_s / mean_step_s.max(1e-9));
+        Some(format!("{name} {step:>width$}/{last_step}  {}  {rate}  {left}", step_metrics(event)))
     }
 }
 
@@ -90,13 +92,23 @@ mod tests {
         // The steps to come have larger images and another pace.
         let expected = "stage1: 100 steps
 stage1: images of 32 x 16 pixels to step 60
-stage1   1/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 15 s to step 60
-stage1  41/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s to step 60
-stage1  81/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s left
-stage1 100/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 0 s left
+stage1   1/100  loss 0.0123  21.50 dB  48 img/s  15 s to 60
+stage1  41/100  loss 0.0123  21.50 dB  48 img/s  5 s to 60
+stage1  81/100  loss 0.0123  21.50 dB  48 img/s  5 s left
+stage1 100/100  loss 0.0123  21.50 dB  48 img/s  0 s left
 stage1: done in 25 s
 ";
         assert_eq!(printed(&events), expected);
+    }
+
+    #[test]
+    fn lines_fit_a_terminal() {
+        let size = Event::ImageSize { stage: Stage::Stage1, size: [128, 128], done: 0, last_step_of_size: 45_000, last_step: 90_000 };
+        let Event::Step(step) = step(12_345, 1.234) else { unreachable!() };
+        let step = StepEvent { last_step: 90_000, last_step_of_size: 45_000, images_per_s: 0.85, ..step };
+        let text = printed(&[size, Event::Step(step)]);
+        assert!(text.ends_with("  0.85 img/s  11 h 11 min to 45000\n"), "{text}");
+        assert!(text.lines().all(|line| line.len() <= 80), "{text}");
     }
 
     #[test]
