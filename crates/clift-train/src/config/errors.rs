@@ -67,7 +67,8 @@ pub(crate) fn wrong_value(
     let Some(span) = span else { return sources.whole(message.to_owned()) };
     if let Some(variant) = between(message, "unknown variant `", "`") {
         let label = nearest(variant, quoted_names(message));
-        let label = label.map_or_else(String::new, |near| format!("did you mean \"{near}\"?"));
+        let other = if path == "device" { "every GPU is \"wgpu\"" } else { "" };
+        let label = label.map_or_else(|| other.into(), |near| format!("did you mean \"{near}\"?"));
         let allowed = quoted_names(message).map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ");
         let help = format!("help: it is one of {allowed}");
         return sources.at(span, format!("unknown value{of_path}"), label).with_note(help);

@@ -52,7 +52,8 @@ pub(crate) fn related_key(name: &str, section: &str, sections: &Sections) -> Opt
     let mut keys: Vec<(&str, &str)> =
         sections.iter().flat_map(|(section, keys)| keys.iter().map(|key| (section.as_str(), key.as_str()))).collect();
     keys.sort_by_key(|(section, _)| near(section));
-    let found = keys.iter().find(|(_, key)| has_initials(key)).or_else(|| keys.iter().find(|(_, key)| shares_word(key)));
+    let found =
+        keys.iter().find(|(_, key)| has_initials(key)).or_else(|| keys.iter().find(|(_, key)| shares_word(key)));
     found.map(|(section, key)| join(section, key))
 }
 

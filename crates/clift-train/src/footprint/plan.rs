@@ -87,13 +87,7 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
 ///
 /// # Errors
 /// As [`plan`].
-pub fn remaining_s(
-    config: &Config,
-    num_ranks: usize,
-    stage: Stage,
-    step: u64,
-    step_s: f64,
-) -> Result<f64, TrainError> {
+pub fn remaining_s(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: f64) -> Result<f64, TrainError> {
     let plan = plan(config, num_ranks)?;
     let settings = config.stage(stage);
     let (batch_size, _) = scenes_of_rank(config, stage, num_ranks);

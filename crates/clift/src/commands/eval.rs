@@ -9,7 +9,7 @@ use clift_scene::TokenCoding;
 use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
 
 use crate::commands::args::model_args::check_network;
-use crate::commands::args::parse::{parse_bytes, parse_split};
+use crate::commands::args::parse::{parse_bytes, parse_run, parse_split};
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt::{self, Ending};
@@ -114,7 +114,7 @@ fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
     /// Run directory
-    #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint")]
+    #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint", value_parser = parse_run)]
     pub run: Option<PathBuf>,
     /// Evaluate a model directory (from `clift import`) instead of a run
     #[arg(long, value_name = "MODEL", requires = "data")]
@@ -136,7 +136,7 @@ pub struct EvalArgs {
     ///
     /// Runs with `model.architecture = "lvsm-ed"` are trained on their own and have distinct numbers of latents. The
     /// option is repeatable: `clift eval RUN --preset main --with runs/lvsm-64 --with runs/lvsm-16` is the paper's main figure.
-    #[arg(long, value_name = "RUN", conflicts_with = "checkpoint")]
+    #[arg(long, value_name = "RUN", conflicts_with = "checkpoint", value_parser = parse_run)]
     pub with: Vec<PathBuf>,
     /// Stored token counts, as numbers or shares, e.g. 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]

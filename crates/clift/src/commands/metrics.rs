@@ -8,6 +8,7 @@ use anyhow::Context;
 use clift_train::Stage;
 use serde::Deserialize;
 
+use crate::commands::args::parse::parse_run;
 use crate::exit_code::usage_bail;
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
@@ -81,7 +82,8 @@ fn read_rows(run: &Path) -> anyhow::Result<Rows> {
         if !is_step && !path.exists() {
             continue;
         }
-        let text = std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("reading {}, which the first step writes", path.display()))?;
         // A run that is training may have written a part of its last line.
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
         for (number, line) in whole.lines().enumerate() {
@@ -125,6 +127,7 @@ fn scalars(rows: &Rows, stage: Stage) -> impl Iterator<Item = Scalar<'static>> {
 #[derive(Debug, clap::Args)]
 pub struct MetricsArgs {
     /// Run directory, also of a run that is training
+    #[arg(value_parser = parse_run)]
     pub run: PathBuf,
     /// Write a row per step, with the validation of the step
     #[arg(long, value_name = "FILE")]

@@ -8,6 +8,7 @@ use clift_train::{
     BatchParts, Config, Event, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning, remaining_s,
 };
 
+use crate::commands::args::adapter::name_adapter;
 use crate::commands::args::parse::{parse_count, parse_training_step};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::ranks::{connect, finish};
@@ -32,6 +33,7 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     if let Ok(Some(warning)) = memory_warning(&of_rank, available_bytes(config.device)) {
         print_warning(warning);
     }
+    name_adapter(config.device, true);
     let stop = interrupt::flag(Ending::RUN)?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();

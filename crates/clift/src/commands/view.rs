@@ -24,7 +24,8 @@ const MAX_SCENES: usize = 200;
 pub struct ViewArgs {
     /// Scene file; run or model, whose test scenes are listed; or photos [default: models/rooms]
     ///
-    /// Photos are encoded with models/rooms, which ships with clift, or with the model that `CLIFT_MODEL` names.
+    /// Of a run in training, the newest checkpoint renders. Photos are encoded with models/rooms, which ships with clift, or with
+    /// the model that `CLIFT_MODEL` names.
     #[arg(value_name = "SCENE|RUN|DIR")]
     pub scene: Option<PathBuf>,
     /// Capture or data set in any layout [default: the data of the run]
@@ -53,6 +54,9 @@ pub struct ViewArgs {
 pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
     let scene = args.scene.clone().unwrap_or_else(default_model);
     let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene) || is_shipped(&scene);
+    if !is_run && !scene.exists() {
+        usage_bail!("{}: no such file or folder", scene.display());
+    }
     let (scenes, device) = if is_run { open_run(&scene, args)? } else { open_file(&scene, args)? };
     let server = ViewServer::bind((args.listen, args.port).into())?;
     let (url, port) = (server.url(), server.address().port());
@@ -96,7 +100,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     if args.model.is_some() {
         usage_bail!("--model is for scene files, {} is a folder; write `clift view RUN DIR`", scene.display());
     }
-    let model_args = ModelArgs::find(scene, args.data.as_deref(), &args.overrides)?;
+    let model_args = ModelArgs::find_newest(scene, args.data.as_deref(), &args.overrides)?;
     let opened = model_args.open_data(args.split)?;
     let model = model_args.open()?;
     require_places(&model_args.config.model, &model_args.given)?;

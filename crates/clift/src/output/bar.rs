@@ -14,6 +14,8 @@ use crate::output::visible::visible;
 #[derive(Default)]
 pub struct Bar {
     bar: Option<ProgressBar>,
+    /// Whether the bar has shown no step.
+    is_new: bool,
 }
 
 impl Sink for Bar {
@@ -29,6 +31,7 @@ impl Sink for Bar {
                 None => print_note(&line),
             }
         }
+        self.is_new |= matches!(event, Event::StepStarted { .. } | Event::ImageSize { .. });
         match (event, &self.bar) {
             (Event::StepStarted { run_step, done, num_steps }, _) => {
                 self.bar = Some(progress_bar(run_step.name(), *done, *num_steps));
@@ -38,8 +41,12 @@ impl Sink for Bar {
                 self.bar = Some(progress_bar_to(*last_step_of_size, stage.name(), *done, *last_step));
             }
             (Event::Step(step), Some(bar)) => {
+                // The first step may compile kernels: its time is no pace.
                 bar.set_message(format!("{}  {}", step_metrics(step), image_rate(step.images_per_s)));
                 bar.set_position(step.step);
+                if std::mem::take(&mut self.is_new) {
+                    bar.reset_eta();
+                }
             }
             (Event::Progress { done, .. }, Some(bar)) => bar.set_position(*done),
             _ => {}

@@ -6,9 +6,9 @@ use clift_data::{
     DataError, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
     open_source,
 };
-use clift_model::{ModelConfig, ModelError, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
+use clift_model::{ModelConfig, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
 use clift_scene::default_num_context;
-use clift_train::{Config, Override};
+use clift_train::{Config, NewestCheckpoint, Override, TrainError};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
@@ -27,6 +27,8 @@ pub struct ModelArgs {
     overrides: Vec<Override>,
     /// Data set or capture beside the model.
     pub folder: Option<PathBuf>,
+    /// The weights of a run in training, in place of those of `path`.
+    checkpoint: Option<NewestCheckpoint>,
 }
 
 impl ModelArgs {
@@ -40,12 +42,24 @@ impl ModelArgs {
         Self::new(first, folder, args)
     }
 
+    /// Takes what [`find`](Self::find) takes; of a run in training, the weights of its newest checkpoint.
+    pub fn find_newest(first: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
+        let Some(checkpoint) = NewestCheckpoint::find(first)? else { return Self::find(first, folder, args) };
+        let NewestCheckpoint { stage, step, path } = &checkpoint;
+        print_note(&format!("{} in training, step {step}: {}", stage.name(), path.display()));
+        let path = ModelPath { dir: first.into(), weights: path.join("model.bpk") };
+        Ok(Self { checkpoint: Some(checkpoint), ..Self::read(first, path, folder, args)? })
+    }
+
     /// Reads the config of a model. The config of an imported model has no data.
     pub fn new(model: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
         if !model.exists() && !is_shipped(model) {
             usage_bail!("{}: no such file or folder", model.display());
         }
-        let path = ModelPath::find(model)?;
+        Self::read(model, ModelPath::find(model)?, folder, args)
+    }
+
+    fn read(model: &Path, path: ModelPath, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
         let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
         check_network(&config.model, &path)?;
         let sizes = overrides.iter().filter(|change| ["data.width", "data.height"].contains(&change.key.as_str()));
@@ -61,7 +75,7 @@ impl ModelArgs {
             config.data.root.clone_from(&folder);
         }
         config.validate()?;
-        Ok(Self { given: model.into(), path, config, overrides, folder })
+        Ok(Self { given: model.into(), path, config, overrides, folder, checkpoint: None })
     }
 
     /// Opens one split of the folder, or of the data of the config.
@@ -96,8 +110,12 @@ impl ModelArgs {
     }
 
     /// Reads the weights.
-    pub fn open(&self) -> Result<TrainedModel, ModelError> {
-        TrainedModel::open_with(&self.path, &self.config.model, &self.config.device.open()?)
+    pub fn open(&self) -> Result<TrainedModel, TrainError> {
+        let device = self.config.device.open()?;
+        match &self.checkpoint {
+            Some(checkpoint) => checkpoint.open(&self.config, &self.path.dir, &device),
+            None => Ok(TrainedModel::open_with(&self.path, &self.config.model, &device)?),
+        }
     }
 }
 

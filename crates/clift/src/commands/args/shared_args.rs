@@ -48,8 +48,8 @@ impl ConfigArgs {
     }
 }
 
-/// Reads a config, applies the overrides of `--set`, checks the values and prints what changed. A missing `configs/NAME.toml`
-/// is the one inside the program.
+/// Reads a config, applies the overrides of `--set`, checks the values and prints what changed. Where a path of [`CONFIGS`] does
+/// not exist, the config inside the program is read.
 pub fn read_config(
     path: &Path,
     set: &[String],
@@ -119,5 +119,21 @@ impl ChunkArgs {
 
     pub fn encoding(&self) -> ImageEncoding {
         self.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_program_contains_every_config() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+        let mut names: Vec<String> = std::fs::read_dir(folder)
+            .unwrap()
+            .map(|item| format!("configs/{}", item.unwrap().file_name().to_string_lossy()))
+            .collect();
+        names.sort();
+        assert!(CONFIGS.iter().map(|(name, _)| name).eq(&names), "{names:?} are in the repository");
     }
 }

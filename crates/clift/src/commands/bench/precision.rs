@@ -23,7 +23,8 @@ pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let json = timing.json.open(&[&args.config])?;
     let config = timing.config.read(&args.config, |_| Ok(()))?;
-    let report = compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag(Ending::WITHOUT_RESULTS)?)?;
+    let report =
+        compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag(Ending::WITHOUT_RESULTS)?)?;
     print_result(&report_text(&report))?;
     json.write(&report)
 }

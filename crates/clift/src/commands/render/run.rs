@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_path};
-use clift_data::read_poses;
+use clift_data::{plural, read_poses};
 use clift_eval::available_bytes;
 use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision};
 use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
@@ -81,7 +81,8 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let creating = || format!("creating {}", args.out.display());
     let files = StagedDir::new(&args.out).with_context(creating)?;
     let frames = Frames { height, width, num_render_tokens, fps: args.fps, video: args.video.as_deref() };
-    let Rendered { timing, tokens } = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
+    let Rendered { timing, tokens, has_video } =
+        frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
     let Timing { select_s, render_s } = timing;
     let report = Report {
         scene: scene.key.clone(),
@@ -102,15 +103,19 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     OutputFile::new(&files.path().join(frames::REPORT), false, &[])?.write_json(&report)?;
     files.commit().with_context(creating)?;
     frames::remove_later_frames(&args.out, views.len()).with_context(creating)?;
+    let video = args.video.as_ref().filter(|_| has_video);
     print_result(&format!(
-        "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
-         {:.1} ms per frame on {device} in {precision} (median): {:.1} ms token selection, {:.1} ms rendering",
+        "{}: {} of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
+         {:.1} ms per frame on {device} in {precision} (median): {:.1} ms token selection, {:.1} ms rendering\n\
+         animation, for a browser: {}{}",
         args.out.display(),
-        views.len(),
+        plural(views.len(), "frame"),
         scene.num_tokens(),
         1e3 * (select_s + render_s),
         1e3 * select_s,
         1e3 * render_s,
+        args.out.join(frames::ANIMATION).display(),
+        video.map_or_else(String::new, |video| format!("\nvideo: {}", video.display())),
     ))
 }
 
