@@ -27,7 +27,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 # Keys of metrics.jsonl and summary.json that differ between equal runs: times, memory, and the Pareto front over times.
-TIMES = {"step_s", "time", "render_s", "select_s", "render_median_s", "render_p95_s", "frame_median_s", "frame_p95_s"}
+TIMES = {"step_s", "images_per_s", "time", "render_s", "select_s", "render_median_s", "render_p95_s", "frame_median_s", "frame_p95_s"}
 TIMES |= {"peak_bytes", "pareto_time", "frame_quartiles_s"}
 
 # Small, so that a run takes seconds, and saving all the time.

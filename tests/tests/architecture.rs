@@ -47,7 +47,7 @@ const CRATES: [Crate; 10] = [
     (
         "clift",
         "clift-core clift-kernels clift-model clift-data clift-scene clift-eval clift-train clift-bench clift-view",
-        "interrupt exit_code output threads commands cli reference_pages",
+        "verbosity interrupt exit_code output threads commands cli reference_pages",
     ),
 ];
 

@@ -76,7 +76,9 @@ pub enum EvalError {
         reason: String,
     },
     /// The caller stopped the evaluation.
-    #[error("interrupted during the evaluation, after {done} of {total} scenes; no results were written")]
+    #[error(
+        "interrupted during the evaluation, after {done} of {total} scenes; no results were written: the same command evaluates again"
+    )]
     Interrupted {
         /// Evaluated scenes.
         done: usize,

@@ -41,7 +41,7 @@ pub use sweep::sweep::Sweep;
 // Results and comparisons.
 pub use statistics::compare::{Comparison, Evaluation, MethodFilter};
 pub use statistics::eval_results::EvalResults;
-pub use statistics::summary::Summary;
+pub use statistics::summary::{Summary, training_scenes_note};
 pub use statistics::text_table::table;
 
 // Figures and animations.

@@ -151,6 +151,18 @@ pub enum ModelError {
         /// The expected weight file.
         path: PathBuf,
     },
+    /// The model inside the program could not be written to the data folder of the user.
+    #[error(
+        "writing the model that ships with clift failed: {source}; set XDG_DATA_HOME to a folder that can be written, or \
+         name another model: {path}",
+        path = path.display()
+    )]
+    NotUnpacked {
+        /// Error of the operating system.
+        source: std::io::Error,
+        /// Folder of the model.
+        path: PathBuf,
+    },
     /// Weight file without the config of its run.
     #[error(
         "no config.toml next to {path} or in its parent directory: the network's sizes are unknown; give the run \

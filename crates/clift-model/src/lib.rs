@@ -66,7 +66,7 @@ pub use error::ModelError;
 pub use names::{parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
-pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes};
+pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes, used_adapter};
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras
@@ -124,4 +124,5 @@ pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
+pub use weights::shipped_model::{SHIPPED_MODEL, find_shipped, is_shipped};
 pub use weights::trained_model::{TrainedModel, open_renderer};

@@ -20,7 +20,9 @@ pub enum SceneError {
         reason: String,
     },
     /// The caller stopped the fit of a codec.
-    #[error("interrupted while fitting the token codec, after {done} of {total} scenes; no codec was written")]
+    #[error(
+        "interrupted while fitting the token codec, after {done} of {total} scenes; no codec was written: the same command fits it"
+    )]
     Interrupted {
         /// Scenes that were read.
         done: usize,

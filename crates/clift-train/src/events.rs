@@ -77,6 +77,10 @@ pub struct StepEvent {
     pub grad_norm: f64,
     /// Seconds of wall time.
     pub step_s: f64,
+    /// Target images of the batch per second of the update.
+    pub images_per_s: f64,
+    /// Peak memory of the process so far; `None` if the system does not report it.
+    pub peak_bytes: Option<u64>,
 }
 
 /// An event of a run.

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
 use clift_core::derive_seed;
-use clift_data::ClipReader;
+use clift_data::{ClipReader, plural};
 use clift_eval::{EvalConfig, EvalError, EvalFrames, EvalSplit, evaluation_items};
 use clift_model::{Grouping, ModelPath, TrainedModel};
 use clift_scene::{CodecOptions, FitProgress, FittedCodec, SceneError, TokenCodec, fit_codec};
@@ -52,10 +52,7 @@ pub fn fit_token_codec(
         seed: derive_seed(config.seed, "codec"),
     };
     let mut progress = FitEvents { stop, sink };
-    let fitted = fit_codec(model, reader, &items, &options, &mut progress).map_err(|error| match error {
-        SceneError::Interrupted { .. } => TrainError::Abandoned { task: "fitting the token codec".into() },
-        error => error.into(),
-    })?;
+    let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
     fitted.codec.write(&TokenCodec::path_of(weights))?;
     Ok(fitted)
 }
@@ -99,7 +96,7 @@ pub(crate) fn ensure_codec(
     let data = (training, EvalFrames::whole(EvalSplit::Train));
     match fit_token_codec(config, (&model, weights), data, stop, sink) {
         Ok(FittedCodec { num_scenes, .. }) => {
-            sink.event(&Event::Message(format!("token codec: fitted on {num_scenes} training scenes")));
+            sink.event(&Event::Message(format!("token codec: fitted on {}", plural(num_scenes, "training scene"))));
             Ok(())
         }
         Err(TrainError::Eval(EvalError::NoScenes { reason }) | TrainError::Scene(SceneError::NoScenes { reason })) => {

@@ -54,8 +54,9 @@ pub use events::{Event, RunStep, Sink, Stage, StepEvent};
 pub use fit_token_codec::fit_token_codec;
 pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;
+pub use run::lock::RunLock;
 pub use run::run::Run;
-pub use run::run_file::RunOptions;
+pub use run::run_file::{RunOptions, lock_run};
 pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 // One update
@@ -69,6 +70,7 @@ pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};
 // Results of the stages
 pub use checkpoint::checkpoints::Checkpoints;
+pub use checkpoint::newest::NewestCheckpoint;
 pub use checkpoint::progress::TrainingPosition;
 pub use cluster_cache::cache::ClusterCache;
 // Published checkpoints
@@ -79,6 +81,6 @@ pub use interchange::record::{ImportOptions, ImportRecord};
 // Memory and sizes of a run
 pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
 pub use footprint::memory::memory_warning;
-pub use footprint::plan::{PartPlan, Plan, check_plan, plan};
+pub use footprint::plan::{PartPlan, Plan, check_plan, plan, remaining_s};
 // Seeded inputs for tests and benchmarks
 pub use step::seeded_inputs::{ClipShape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};

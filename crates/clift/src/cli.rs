@@ -18,7 +18,7 @@ use crate::commands::plan::PlanArgs;
 use crate::commands::render::args::RenderArgs;
 use crate::commands::train::TrainArgs;
 use crate::commands::view::ViewArgs;
-use crate::output::verbosity::Verbosity;
+use crate::verbosity::Verbosity;
 
 /// Train, compress, render and evaluate scenes of compressive light-field tokens
 #[derive(Debug, Parser)]

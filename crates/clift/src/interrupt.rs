@@ -1,5 +1,7 @@
-//! Ctrl-C, SIGTERM and SIGHUP: the first signal requests a stop after the state is saved, a later one ends the process.
+//! Ctrl-C, SIGTERM and SIGHUP: the first signal requests a stop after the present step, a later one ends the process. Both print
+//! a line.
 
+use std::io::{IsTerminal, stderr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -7,6 +9,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::low_level;
+
+use crate::verbosity::Verbosity;
 
 /// Offset of exit codes of signals, as in shells.
 const SIGNALLED: i32 = 128;
@@ -16,11 +20,36 @@ const REPEAT: Duration = Duration::from_secs(1);
 /// Number of the first signal; 0 for none.
 static FIRST_SIGNAL: AtomicI32 = AtomicI32::new(0);
 
+/// What a command does on its signals, for the lines that they print.
+#[derive(Clone, Copy, Debug)]
+pub struct Ending {
+    /// What the first signal waits for.
+    pub first: &'static str,
+    /// What a second one loses.
+    pub second: &'static str,
+}
+
+impl Ending {
+    /// A command without intermediate results.
+    pub const WITHOUT_RESULTS: Self = Self {
+        first: "finishing this step; Ctrl-C again ends at once\n",
+        second: "ended before this step was finished; no output files were written\n",
+    };
+    /// A training run.
+    pub const RUN: Self = Self {
+        first: "finishing this step and saving; Ctrl-C again ends without saving\n",
+        second: "ended without saving; the same command resumes from the last checkpoint\n",
+    };
+}
+
 /// Listens for signals and returns a flag that the first one sets.
-pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
+pub fn flag(ending: Ending) -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let started = Instant::now();
     let first_ms = Arc::new(AtomicU64::new(u64::MAX));
+    let is_silent = Verbosity::chosen() == Verbosity::Silent;
+    // A terminal has `^C` and a progress bar in this line.
+    let start = if stderr().is_terminal() { "\n" } else { "" };
     let listen = |signal: i32| {
         let (stop, first_ms) = (stop.clone(), first_ms.clone());
         let handle = move || {
@@ -29,13 +58,21 @@ pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
                 Ok(_) => {
                     FIRST_SIGNAL.store(signal, Ordering::SeqCst);
                     stop.store(true, Ordering::SeqCst);
+                    if !is_silent {
+                        print([start, ending.first]);
+                    }
                 }
                 Err(first_ms) if is_repeat(first_ms, now_ms) => {}
-                Err(_) => low_level::exit(SIGNALLED + signal),
+                Err(_) => {
+                    if !is_silent {
+                        print([start, ending.second]);
+                    }
+                    low_level::exit(SIGNALLED + signal)
+                }
             }
         };
-        // SAFETY: the handler reads the clock, writes atomics and calls `_exit`, which are async-signal-safe; it neither
-        // allocates, locks nor panics.
+        // SAFETY: the handler reads the clock, writes atomics and calls `write` and `_exit`, which are async-signal-safe; it
+        // neither allocates, locks nor panics.
         unsafe { low_level::register(signal, handle) }.context("listening for signals")
     };
     for signal in [SIGINT, SIGTERM] {
@@ -46,6 +83,14 @@ pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
         listen(signal_hook::consts::SIGHUP)?;
     }
     Ok(stop)
+}
+
+/// Writes to the standard error without its lock, which the interrupted thread may have.
+fn print(texts: [&'static str; 2]) {
+    for text in texts {
+        // SAFETY: the pointer and the length are those of a string that lives as long as the process.
+        let _ = unsafe { libc::write(2, text.as_ptr().cast(), text.len() as _) };
+    }
 }
 
 /// Whether a signal belongs to the first one.

@@ -16,6 +16,7 @@ mod output;
 #[cfg(test)]
 mod reference_pages;
 mod threads;
+mod verbosity;
 
 use std::process::ExitCode;
 

@@ -47,18 +47,27 @@ fn captures_train_and_render_and_name_missing_frames() {
 }
 
 #[test]
-fn the_shipped_model_encodes_photos_and_is_small() {
+fn the_program_alone_encodes_photos_renders_and_trains() {
     let place = Place::new();
     place.clift("data synth DIR/scene --look real --scenes 1 --frames 16 --size 64x64").ok();
-    let mut command = Command::new(BINARY);
-    command.arg("encode").arg(place.at("scene")).arg("-o").arg(place.at("scene.clift"));
-    let ran = finish(start(command.env_remove("CLIFT_MODEL").current_dir(repository("."))));
-    let ran = ran.ok().prints("4 views of 64 x 64").prints("(clift, coded").notes("model: models/rooms");
+    let alone = |words: &str| {
+        let mut command = Command::new(BINARY);
+        command.args(words.split(' ')).env_remove("CLIFT_MODEL").current_dir(place.at(""));
+        finish(start(&mut command)).ok()
+    };
+    let ran = alone("encode scene -o scene.clift");
+    let ran = ran.prints("4 views of 64 x 64").prints("(clift, coded").notes("model: models/rooms");
     // Its rendering of a frame beside the contexts is better than a copy of the nearest context.
     assert!(ran.stdout.contains("check: frame 2, ") && !ran.stderr.contains("warning"), "{}{}", ran.stdout, ran.stderr);
-    let files = std::fs::read_dir(repository("models/rooms")).unwrap();
-    let bytes: u64 = files.map(|file| file.unwrap().metadata().unwrap().len()).sum();
-    assert!(bytes <= 8_000_000, "{bytes}");
+    alone("render scene.clift --path orbit --frames 2 -o orbit")
+        .prints("animation, for a browser: orbit/animation.png");
+    let ran = alone(
+        "train configs/capture.toml --only stage1 --set data.source=auto --set data.root=scene --set run_dir=run \
+         --set stage1.steps=1 --set stage1.batch_size=1 --set eval.num_validation_scenes=1",
+    );
+    ran.notes("config: configs/capture.toml, which ships with clift").notes(" parameters from ").notes("/rooms-");
+    // Names of the repository, not of files beside the program.
+    alone("plan configs/tiny.toml").prints("stage1");
 }
 
 #[test]

@@ -216,7 +216,8 @@ fn two_evaluations_are_compared_pair_by_pair() {
             assert!((psnr - of_pair(run)).abs() < 1e-9, "the mean over scenes of the summary");
         }
     }
-    place.clift("compare DIR/a no/such/run").fails_with(2, &["no views.csv here or in `eval`", "no/such/run"]);
+    place.clift("compare DIR/a no/such/run").fails_with(2, &["no/such/run", "no such file or folder"]);
+    place.clift("compare DIR/a DIR/a/stage1").fails_with(2, &["no views.csv here or in `eval`; `clift eval` writes"]);
 }
 
 #[test]

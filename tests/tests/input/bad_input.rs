@@ -97,6 +97,9 @@ fn evaluated_scenes_that_train_are_named() {
     copy_folder(&data.join("train"), &data.join("test"));
     let warning = format!("the evaluation shares 2 scenes with training, such as {}", KEYS[0]);
     train_on(&place, "run --only stage1", &data, &[]).ok().notes(&warning);
+    train_on(&place, "run", &data, &[]).ok();
+    place.eval("run").ok().notes(&warning).prints(&format!("warning: {warning}"));
+    assert!(place.text("run/eval/report.html").contains(&format!("Warning: {warning}")));
     let ran = train_on(&place, "other --only stage1", &repository(MINI), &[]).ok();
     assert!(!ran.stderr.contains("with training"), "{}", ran.stderr);
 }

@@ -8,7 +8,7 @@ use crate::support::{BINARY, Place, Ran, clift, finish, repository, start};
 const RIGHT: &str = include_str!("../../snapshots/right.toml");
 
 /// Name, replaced text of the config (where it is first), and replacement.
-const CONFIGS: [(&str, &str, &str); 32] = [
+const CONFIGS: [(&str, &str, &str); 34] = [
     ("unknown-key", "dim = 16", "dimm = 16"),
     ("unknown-section", "[clusters]", "[cluster]"),
     ("key-of-another-section", "num_heads = 2", "num_heads = 2\nbatch_size = 4"),
@@ -27,6 +27,8 @@ const CONFIGS: [(&str, &str, &str); 32] = [
     ("no-heads", "num_heads = 2", "num_heads = 0"),
     ("patches-do-not-divide-the-width", "width = 16", "width = 20"),
     ("patch-beyond-the-picture", "patch_size = 8", "patch_size = 32"),
+    ("number-beyond-64-bits", "steps = 6", "steps = 99999999999999999999"),
+    ("batch-beyond-the-limit", "batch_size = 2\naccumulate", "batch_size = 1000000\naccumulate"),
     ("no-batch", "batch_size = 2\naccumulate", "batch_size = 0\naccumulate"),
     ("more-parts-than-scenes", "accumulate = 1", "accumulate = 3"),
     ("count-beyond-the-tokens", "grid = [0.5, 1.0]", "grid = [0.5, 9]"),
@@ -44,10 +46,12 @@ const CONFIGS: [(&str, &str, &str); 32] = [
 ];
 
 /// Name and `--set` for the valid config.
-const OVERRIDES: [(&str, &str); 9] = [
+const OVERRIDES: [(&str, &str); 11] = [
     ("synthetic-scenes-with-a-folder", "data.root=\"photos\""),
     ("override-without-a-value", "stage1.steps"),
     ("override-of-an-unknown-key", "stage1.step=3"),
+    ("override-by-initials", "stage1.lr=1e-3"),
+    ("override-by-a-word", "data.synthetic.max_fov=90"),
     ("override-below-a-value", "stage1.steps.x=3"),
     ("override-of-another-type", "stage1.steps=ten"),
     ("override-beyond-a-limit", "data.synthetic.fov_deg=180.0"),

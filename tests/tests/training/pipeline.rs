@@ -100,7 +100,7 @@ fn quiet_and_verbose_runs_print_less_and_more() {
     let ran = place.train("quiet --quiet --only stage1", &[]).ok();
     assert!(ran.stderr.is_empty() && ran.stdout.is_empty(), "{} {}", ran.stderr, ran.stdout);
     let ran = place.train("verbose -v --only stage1", &[]).ok();
-    assert_eq!(ran.stderr.matches(" s/step, ").count(), 6, "{}", ran.stderr);
+    assert_eq!(ran.stderr.matches(" img/s").count(), 6, "{}", ran.stderr);
     place.train("quiet -q --only stage1", &["seed=1"]).fails_with(2, &["error: this run was started with other"]);
 }
 

@@ -36,7 +36,10 @@ fn signals_save_and_runs_resume_to_the_same_result() {
         let last = place.metrics("run").pop().expect("a step");
         let (stage, step) = (last["stage"].as_str().expect("text"), last["step"].as_u64().expect("a number"));
         let saved = format!("saved {}", place.at(&format!("run/{stage}/checkpoints")).display());
-        ran.fails_with(code, &[&format!("error: interrupted at step {step}; the same command resumes"), &saved]);
+        let waits = "finishing this step and saving; Ctrl-C again ends without saving\n";
+        let text =
+            ran.fails_with(code, &[&format!("error: interrupted at step {step}; the same command resumes"), &saved]);
+        assert_eq!(text.matches(waits).count(), 1, "{text}");
         assert_eq!(place.checkpoints("run", stage).last(), Some(&step));
         assert!(!place.at(&format!("run/{stage}/model.safetensors")).exists());
     }
@@ -61,7 +64,9 @@ fn second_signals_end_runs_after_a_second() {
     let started = Instant::now();
     let ran = finish(child);
     assert!(started.elapsed() < Duration::from_secs(5) && ran.code == Some(143), "{:?}: {}", ran.code, ran.stderr);
-    assert!(!ran.stderr.contains("saved") && !place.at("run/stage1/checkpoints").exists(), "{}", ran.stderr);
+    let ended = "ended without saving; the same command resumes from the last checkpoint\n";
+    assert!(ran.stderr.ends_with(ended), "{}", ran.stderr);
+    assert!(!ran.stderr.contains("saved ") && !place.at("run/stage1/checkpoints").exists(), "{}", ran.stderr);
 }
 
 #[test]
@@ -108,6 +113,7 @@ fn second_processes_are_refused_while_the_first_lives() {
     }
     assert!(!place.at("run.1").exists(), "nothing was moved from under it");
     place.eval("run").fails_with(1, &[&holder]);
+    place.clift("codec DIR/run").fails_with(1, &[&holder, "or set another model"]);
     // Elsewhere an evaluation may write; there are no weights yet.
     place.eval("run --out DIR/elsewhere").fails_with(2, &["the weights of stage 1"]);
 

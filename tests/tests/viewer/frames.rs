@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clift_core::{median, p95};
 
-use crate::support::{Place, WHOLE};
+use crate::support::{Place, STAGE_1, WHOLE};
 use crate::viewer::tab::{Picture, Tab, Viewer};
 
 /// Measures a scene: `CLIFT_VIEW_SCENE=room.clift cargo test --release --workspace viewer_speed -- --ignored --nocapture`.
@@ -45,6 +45,19 @@ fn pictures_follow_cameras_and_token_counts_at_once() {
     for i in 0..200 {
         let tokens = 1 + i % stored;
         assert_eq!(tab.picture(tokens).header["tokens"], tokens, "the next frame has the new count");
+    }
+}
+
+#[test]
+fn runs_in_training_are_shown_from_the_newest_checkpoint() {
+    for (shared, stage) in [(&STAGE_1, "stage1"), (&WHOLE, "stage2")] {
+        let place = Place::with(shared);
+        let before = Tab::open(&Viewer::start(&["run"], &place.at(""))).scene["token_ids"].clone();
+        std::fs::remove_file(place.at(&format!("run/{stage}/model.safetensors"))).expect("the weights of the stage");
+        let viewer = Viewer::start(&["run"], &place.at(""));
+        let mut tab = Tab::open(&viewer);
+        assert_eq!(tab.scene["token_ids"], before);
+        assert_eq!(tab.picture(2).header["tokens"], 2);
     }
 }
 

@@ -25,7 +25,7 @@ impl Viewer {
     /// Starts `clift view` with these words in a folder, by default on a free port and without a browser.
     pub fn start(words: &[&str], folder: &std::path::Path) -> Self {
         let mut command = Command::new(BINARY);
-        command.arg("view").args(words).current_dir(folder);
+        command.arg("view").args(words).current_dir(folder).env("XDG_DATA_HOME", env!("CARGO_TARGET_TMPDIR"));
         if !words.contains(&"--no-open") {
             command.arg("--no-open");
         }

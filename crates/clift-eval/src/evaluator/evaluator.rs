@@ -1,5 +1,6 @@
 //! Evaluation of trained models on test scenes, with all output files.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use burn::tensor::Device;
@@ -40,6 +41,8 @@ pub struct Evaluator {
     split: EvalSplit,
     /// The scenes that were skipped when the views were chosen.
     pub skip_report: SkipReport,
+    /// Keys of the scenes that the models were trained on.
+    pub training_scenes: BTreeSet<String>,
     device: Device,
 }
 
@@ -64,7 +67,8 @@ impl Evaluator {
         let tokens_per_view = sweep.model.num_patches(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
         check_counts(eval, fewest_views * tokens_per_view, sweep.model.architecture)?;
-        Ok(Self { sweep, description, reader, items, split, skip_report, device: device.clone() })
+        let (training_scenes, device) = (BTreeSet::new(), device.clone());
+        Ok(Self { sweep, description, reader, items, split, skip_report, training_scenes, device })
     }
 
     /// Returns the keys of the measured scenes.
@@ -166,6 +170,7 @@ impl Evaluator {
         let _precision = self.sweep.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
         measured.split = Some(self.split);
+        measured.training_scenes.clone_from(&self.training_scenes);
         measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
         let process = progress.process();

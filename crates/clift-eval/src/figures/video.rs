@@ -81,7 +81,9 @@ impl Video {
         if let Some(mut stderr) = self.ffmpeg.stderr.take() {
             drop(stderr.read_to_string(&mut text));
         }
-        let last = text.lines().rev().find(|line| !line.trim().is_empty());
+        // A full disk has a line of its own before the last.
+        let full = text.lines().find(|line| line.contains("No space left"));
+        let last = full.or_else(|| text.lines().rev().find(|line| !line.trim().is_empty()));
         let error = last.map_or(error, |line| std::io::Error::other(line.trim().to_owned()));
         EvalError::io("writing the video", &self.path)(error)
     }

@@ -19,6 +19,15 @@ pub fn count(count: usize) -> String {
     grouped(count as f64, 0)
 }
 
+/// Returns a message, its parts in backquotes as code.
+pub fn text(message: &str) -> Markup {
+    html! {
+        @for (i, part) in message.split('`').enumerate() {
+            @if i % 2 == 1 { code { (part) } } @else { (part) }
+        }
+    }
+}
+
 /// Returns a table that scrolls within the page. A line break in a name of the head starts a second line.
 pub fn table(class: Option<&str>, head: &[&str], rows: &Markup) -> Markup {
     html! {

@@ -11,7 +11,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use crate::error::EvalError;
 use crate::figures::scene_figure::SceneFigure;
 use crate::report::axis::{grouped, milliseconds};
-use crate::report::html::{count, number};
+use crate::report::html::{count, number, text};
 use crate::report::plots::plots;
 use crate::report::training::{self, TrainingCurve};
 use crate::report::{scene_list, scene_section, tables};
@@ -86,7 +86,7 @@ impl Report {
                             "clift evaluation, " (httpdate::fmt_http_date(SystemTime::now().max(UNIX_EPOCH)))
                             @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
                         }
-                        @for warning in self.summary.warnings() { p.warning { "Warning: " (warning) } }
+                        @for warning in self.summary.warnings() { p.warning { "Warning: " (text(&warning)) } }
                         (self.headline())
                         (self.quality_and_cost())
                         (tables::points(&self.summary))
@@ -136,8 +136,8 @@ impl Report {
                     (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.quality.psnr, 2), "dB", &error))
                 }
                 (tile("nearest view", &number(nearest, 2), "dB", &copies(baselines.nearest_view.num_identical_views)))
-                @if let Some((point, kb)) = first.and_then(|point| Some((point, point.cost.scene_kb()?))) {
-                    (tile("a scene file", &grouped(kb, 1), "kB", &tokens(point)))
+                @if let Some((point, (kb, format))) = first.and_then(|point| Some((point, scene_file(point)?))) {
+                    (tile("a scene file", &grouped(kb, 1), "kB", &format!("{}, {format}", tokens(point))))
                 }
                 @if let Some((point, seconds)) = last.and_then(|point| Some((point, point.frame_median_s?))) {
                     (tile("a frame", &milliseconds(seconds), "ms", &tokens(point)))
@@ -190,6 +190,12 @@ impl Report {
             }
         })
     }
+}
+
+/// Returns the size of a scene file in kB, as `clift encode` writes it where the model has a codec, and its format.
+fn scene_file(point: &SummaryPoint) -> Option<(f64, String)> {
+    let evaluated = || Some((point.cost.scene_kb()?, point.key.tokens?.to_string()));
+    point.cost.coded_bytes.map(|bytes| (bytes as f64 / 1e3, "coded".into())).or_else(evaluated)
 }
 
 fn psnr_at(point: &SummaryPoint) -> Markup {

@@ -10,7 +10,8 @@ use crate::report::axis::{Axis, Scale};
 const WIDTH: f64 = 460.0;
 const HEIGHT: f64 = 320.0;
 const LEFT: f64 = 64.0;
-const RIGHT: f64 = 12.0;
+// Half of a label such as `1,000` fits beyond the last tick.
+const RIGHT: f64 = 24.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 48.0;
 

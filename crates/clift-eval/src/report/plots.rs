@@ -22,6 +22,8 @@ pub fn plots(summary: &Summary) -> Vec<Plot> {
         let kb = |point: &SummaryPoint| point.cost.scene_kb();
         plots.push(Plot {
             heading: "Quality against the size of a scene",
+            note: "Sizes are those of the evaluated formats. Coded tokens, which clift encode writes by default, take a \
+                   fraction of them: eval --format f32,coded measures both.",
             front: front(summary, |point| point.pareto_bytes, kb),
             ..by_method(summary, "scene, kB", Scale::Log, kb)
         });

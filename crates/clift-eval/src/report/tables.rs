@@ -5,7 +5,7 @@ use clift_scene::TokenCoding;
 use maud::{Markup, html};
 
 use crate::report::axis::{grouped, milliseconds};
-use crate::report::html::{DASH, count, number, table};
+use crate::report::html::{DASH, count, number, table, text};
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::system::machine::machine_rows;
@@ -85,7 +85,7 @@ pub fn points(summary: &Summary) -> Markup {
             }
         }
         @for missing in not_measured {
-            p.note { code { (missing.metric) } " is not measured: " (missing.reason) }
+            p.note { code { (missing.metric) } " is not measured: " (text(&missing.reason)) }
         }
     }
 }
@@ -145,7 +145,7 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
 
 /// Returns the number of evaluated scenes, and the reasons of the skipped scenes.
 pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
-    let rows = html! { @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } } };
+    let rows = html! { @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (text(&reason)) } } } };
     html! {
         h2 { "Skipped scenes" }
         p { (count(num_evaluated)) " of " (count(skip_report.num_scenes)) " scenes were evaluated." }

@@ -29,6 +29,8 @@ pub struct EvalResults {
     pub(crate) costs: BTreeMap<EvalKey, Cost>,
     /// Sizes of the scene files of every key.
     scene_bytes: BTreeMap<EvalKey, Vec<u64>>,
+    /// Sizes of the scene files with the default coding.
+    coded_bytes: BTreeMap<EvalKey, Vec<u64>>,
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
     pub(crate) missing: BTreeMap<Method, BTreeSet<String>>,
@@ -39,6 +41,8 @@ pub struct EvalResults {
     pub(crate) split: Option<EvalSplit>,
     /// Scene and frame of the targets that are also contexts.
     pub(crate) context_targets: BTreeSet<(String, usize)>,
+    /// Keys of the scenes that the models were trained on.
+    pub(crate) training_scenes: BTreeSet<String>,
 }
 
 impl EvalResults {
@@ -67,6 +71,11 @@ impl EvalResults {
                 self.add_scene_bytes(key, bytes);
             }
         }
+        for (key, sizes) in other.coded_bytes {
+            for bytes in sizes {
+                self.add_coded_bytes(key, bytes);
+            }
+        }
         for (method, images) in other.missing {
             self.missing.entry(method).or_default().extend(images);
         }
@@ -90,8 +99,14 @@ impl EvalResults {
     pub fn add_scene_bytes(&mut self, key: EvalKey, bytes: u64) {
         let sizes = self.scene_bytes.entry(key).or_default();
         sizes.push(bytes);
-        let mean = sizes.iter().sum::<u64>() as f64 / sizes.len() as f64;
-        self.costs.entry(key).or_default().scene_bytes = Some(mean.round() as u64);
+        self.costs.entry(key).or_default().scene_bytes = Some(mean(sizes));
+    }
+
+    /// Records the size of a scene file with the default coding. The cost of a key has the mean over scenes.
+    pub(crate) fn add_coded_bytes(&mut self, key: EvalKey, bytes: u64) {
+        let sizes = self.coded_bytes.entry(key).or_default();
+        sizes.push(bytes);
+        self.costs.entry(key).or_default().coded_bytes = Some(mean(sizes));
     }
 
     /// Records why a metric is not measured.
@@ -103,6 +118,10 @@ impl EvalResults {
     pub fn record_missing_image(&mut self, method: Method, image: String) {
         self.missing.entry(method).or_default().insert(image);
     }
+}
+
+fn mean(sizes: &[u64]) -> u64 {
+    (sizes.iter().sum::<u64>() as f64 / sizes.len() as f64).round() as u64
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use clift_core::{mean, median, p95, quartiles, replace_file, standard_error};
+use clift_data::plural;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
@@ -116,6 +117,8 @@ pub struct Summary {
     pub split: Option<EvalSplit>,
     /// Target views that are also contexts: the input holds their images.
     pub num_context_targets: usize,
+    /// Scenes that the models were trained on.
+    pub training_scenes: BTreeSet<String>,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
     /// SHA-256 of the LPIPS weights.
@@ -159,6 +162,7 @@ impl Summary {
             num_skipped: results.skipped.len(),
             split: results.split,
             num_context_targets: results.context_targets.len(),
+            training_scenes: results.training_scenes.clone(),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
@@ -172,7 +176,8 @@ impl Summary {
     /// Returns warnings about figures that mislead.
     pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
         let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);
-        split.into_iter().chain(context_targets_note(self.num_context_targets))
+        let split = split.into_iter().chain(training_scenes_note(&self.training_scenes));
+        split.chain(context_targets_note(self.num_context_targets))
     }
 
     /// Returns the points of the main method in its finest number format.
@@ -193,6 +198,15 @@ impl Summary {
             .and_then(|json| replace_file(path, &[&json[..], b"\n"].concat()))
             .map_err(EvalError::io("writing the summary", path))
     }
+}
+
+/// Returns the warning about measured scenes that the models were trained on; `None` for no such scene.
+pub fn training_scenes_note(scenes: &BTreeSet<String>) -> Option<String> {
+    let first = scenes.first()?;
+    Some(format!(
+        "the evaluation shares {} with training, such as {first}: the results are not of held-out scenes",
+        plural(scenes.len(), "scene"),
+    ))
 }
 
 /// Returns the note on targets that are also contexts; `None` for no such target.
@@ -322,8 +336,8 @@ mod tests {
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
-        let cost =
-            Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
+        views.training_scenes.insert("a".into());
+        let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
         views.note_not_measured("lpips_vgg", "no weights".into());
@@ -333,6 +347,7 @@ mod tests {
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
+            "training_scenes": ["a"],
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],
@@ -346,7 +361,7 @@ mod tests {
                 "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
                 "render_s": null, "render_median_s": null, "render_p95_s": null,
                 "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
-                "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "peak_bytes": 1_048_576,
+                "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "coded_bytes": null, "peak_bytes": null,
                 "pareto_time": false, "pareto_bytes": true
             }],
             "differences": []

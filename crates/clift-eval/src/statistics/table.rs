@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use clift_data::plural;
+
 use crate::config::method::Method;
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Quality, Summary, SummaryPoint};
@@ -32,7 +34,9 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
         let split = self.split.map_or_else(String::new, |split| format!(" ({split})"));
-        writeln!(f, "{num_views} views of {num_scenes} scenes{split}, {num_skipped} scenes skipped")?;
+        let [views, scenes, skipped] = [(*num_views, "view"), (*num_scenes, "scene"), (*num_skipped, "scene")]
+            .map(|(count, noun)| plural(count, noun));
+        writeln!(f, "{views} of {scenes}{split}, {skipped} skipped")?;
         for warning in self.warnings() {
             writeln!(f, "warning: {warning}")?;
         }

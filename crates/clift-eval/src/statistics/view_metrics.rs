@@ -118,6 +118,8 @@ pub struct Cost {
     pub scene_values: Option<u64>,
     /// Mean bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
+    /// Mean bytes of a scene file as `clift encode` writes it by default: of condensed tokens with a codec.
+    pub coded_bytes: Option<u64>,
     /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
     pub peak_bytes: Option<u64>,
 }

@@ -7,7 +7,7 @@ use std::time::Instant;
 use clift_core::{derive_seed, median};
 use clift_data::Clip;
 use clift_model::{Cameras, FlopConvention, Grouping, Tokens, TrainedModel, Views};
-use clift_scene::TokenCoding;
+use clift_scene::{CodedLoss, TokenCoding};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
@@ -134,6 +134,12 @@ fn add_jobs<'a>(
                 if let Some(bytes) = stored.file_bytes {
                     jobs[first..].iter().for_each(|job| metrics.add_scene_bytes(job.key, bytes));
                 }
+                if method == Method::Clift && models.codec.is_some() {
+                    let default = TokenCoding::Coded(CodedLoss::default());
+                    let place = (clip, &*sweep.model_path);
+                    let coded = CompressedTokens::new(method, models, (lift, clusters), default, place)?;
+                    metrics.add_coded_bytes(whole, coded.file_bytes.unwrap_or_default());
+                }
             }
         }
         if !kept_views.is_empty() {
@@ -238,7 +244,7 @@ impl TargetRenderer<'_> {
         let macs = job.model.config.render_macs(target.height, target.width, job.key.num_render_tokens)?;
         let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
         let scene_values = Some((job.key.num_storage_tokens * job.model.config.dim) as u64);
-        cost.insert(Cost { gflops, scene_values, peak_bytes, scene_bytes: None });
+        cost.insert(Cost { gflops, scene_values, peak_bytes, ..Cost::default() });
         Ok(())
     }
 

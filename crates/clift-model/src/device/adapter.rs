@@ -1,5 +1,7 @@
 //! Adapters of the graphics API, GPUs and software renderers, and their limits.
 
+use std::fmt;
+
 use burn::tensor::Device;
 
 /// Environment variable that selects an adapter by its [`Adapter::selector`]. `CubeCL` reads the variable.
@@ -62,6 +64,19 @@ pub fn max_tensor_bytes(device: &Device) -> Option<u64> {
 #[cfg(not(feature = "wgpu"))]
 pub fn max_tensor_bytes(_device: &Device) -> Option<u64> {
     None
+}
+
+impl fmt::Display for Adapter {
+    /// Writes name, kind, API and driver.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, kind, api, driver, .. } = self;
+        write!(f, "{name} ({kind}, {api}, driver {driver})")
+    }
+}
+
+/// Returns the adapter of the device `wgpu`; `None` without one, and where the driver panics.
+pub fn used_adapter() -> Option<Adapter> {
+    std::panic::catch_unwind(adapters).ok()?.into_iter().find(|adapter| adapter.is_used)
 }
 
 /// Returns no adapters: this build does not contain the device `wgpu`.

@@ -103,7 +103,7 @@ impl std::str::FromStr for DeviceName {
     fn from_str(name: &str) -> Result<Self, ModelError> {
         parse_variant(name).ok_or_else(|| ModelError::NoDevice {
             name: name.into(),
-            reason: format!("unknown; use one of {}", names::<Self>()),
+            reason: format!("unknown; use one of {}; every GPU is `wgpu`", names::<Self>()),
         })
     }
 }

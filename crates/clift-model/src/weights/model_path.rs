@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::error::ModelError;
 use crate::network::config::ModelConfig;
 use crate::tokens::kind::TokenKind;
+use crate::weights::shipped_model::find_shipped;
 
 /// A run or model directory, and one of its weight files.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -19,12 +20,13 @@ pub struct ModelPath {
 
 impl ModelPath {
     /// Finds the weights of a run directory, a stage folder (`RUN/stage2`) or a model directory; or the config of a weight
-    /// file in one of these.
+    /// file in one of these; or the [shipped model](crate::find_shipped).
     ///
     /// # Errors
     /// [`ModelError::NoModel`] if no weights are found, [`ModelError::NoConfig`] for a weight file without a config,
-    /// [`ModelError::NotImported`] for a PyTorch checkpoint.
+    /// [`ModelError::NotImported`] for a PyTorch checkpoint, and those of [`find_shipped`](crate::find_shipped).
     pub fn find(path: &Path) -> Result<Self, ModelError> {
+        let path = &*find_shipped(path)?;
         let inside = path.join(WEIGHTS);
         if path.is_dir() && inside.is_file() {
             // The config of a stage folder is in the run directory.
@@ -50,13 +52,17 @@ impl ModelPath {
 
     /// Returns the weight file that renders tokens of a kind: that of stage 1 or 2 of a run directory, that of a model
     /// directory, or `path` itself if `path` is not a directory. The file need not exist.
-    pub fn for_tokens(path: &Path, kind: TokenKind) -> PathBuf {
+    ///
+    /// # Errors
+    /// Those of [`find_shipped`](crate::find_shipped).
+    pub fn for_tokens(path: &Path, kind: TokenKind) -> Result<PathBuf, ModelError> {
+        let path = &*find_shipped(path)?;
         let inside = path.join(WEIGHTS);
-        match (path.is_dir(), inside.is_file()) {
+        Ok(match (path.is_dir(), inside.is_file()) {
             (true, true) => inside,
             (true, false) => weights_of(path, kind),
             (false, _) => path.into(),
-        }
+        })
     }
 
     /// Reads `[model]` of `config.toml`; the other sections are ignored.
@@ -182,8 +188,8 @@ mod tests {
         assert_eq!(ModelPath::find(&run).unwrap().weights, stage2);
         assert_eq!(ModelPath::find(&stage1).unwrap(), ModelPath { dir: run.clone(), weights: stage1.clone() });
         assert_eq!(ModelPath::find(&run.join("stage1")).unwrap(), ModelPath::find(&stage1).unwrap());
-        assert_eq!(ModelPath::for_tokens(&run, TokenKind::Kmeans), stage1);
-        assert_eq!(ModelPath::for_tokens(&stage2, TokenKind::Clift), stage2);
+        assert_eq!(ModelPath::for_tokens(&run, TokenKind::Kmeans).unwrap(), stage1);
+        assert_eq!(ModelPath::for_tokens(&stage2, TokenKind::Clift).unwrap(), stage2);
 
         let alone = folder.path().join("alone.safetensors");
         let message = ModelPath::find(&alone).unwrap_err().to_string();

@@ -3,6 +3,7 @@
 use std::path::{Component, Path, PathBuf};
 
 use clift_core::folder_of;
+use clift_model::SHIPPED_MODEL;
 
 use crate::scene::scene::Scene;
 
@@ -23,12 +24,14 @@ impl Scene {
     }
 
     /// Returns the path of the model of the scene that was read from `file`. A relative model path starts at the folder of
-    /// the file. The path need not exist.
+    /// the file. The path need not exist. A missing `models/rooms` is the [shipped model](clift_model::find_shipped).
     pub fn find_model(&self, file: &Path) -> PathBuf {
         find_model(&self.model_path, file)
     }
 }
 
 pub(crate) fn find_model(model_path: &str, file: &Path) -> PathBuf {
-    folder_of(file).join(model_path)
+    let path = folder_of(file).join(model_path);
+    // The scene may come from a machine that has the repository.
+    if path.ends_with(SHIPPED_MODEL) && !path.exists() { SHIPPED_MODEL.into() } else { path }
 }

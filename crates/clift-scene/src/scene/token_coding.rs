@@ -81,8 +81,8 @@ impl FromStr for TokenCoding {
             return format.ok_or_else(|| bad(format!("write one of {}", Self::NAMES)));
         };
         match loss.parse() {
-            Ok(loss) if (1e-3..=1e3).contains(&loss) => Ok(Self::Coded(CodedLoss::from_db(loss))),
-            _ => Err(bad("write a loss of 0.001 dB or more, such as coded-0.1".into())),
+            Ok(loss) if (1e-3..=10.0).contains(&loss) => Ok(Self::Coded(CodedLoss::from_db(loss))),
+            _ => Err(bad("write a loss of 0.001 to 10 dB, such as coded-0.1".into())),
         }
     }
 }

@@ -8,7 +8,7 @@ use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
 use clift_core::{make_folder, publish_folder, remove_folder};
-use clift_model::{ModelConfig, first_not_f32};
+use clift_model::{Clift, ModelConfig, first_not_f32};
 
 use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};
 use crate::config::config::CheckpointConfig;
@@ -137,6 +137,15 @@ impl Checkpoints {
         apply(state, &path, self.model.as_ref(), train_state)
     }
 
+    /// Returns `model` with the weights of the checkpoint of a step, without reading the optimizer. Changes no file.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn load_model(&self, step: u64, model: Clift) -> Result<Clift, TrainError> {
+        let path = self.path_of(step);
+        apply_model(&verify(&path)?, &path, self.model.as_ref(), model)
+    }
+
     /// Returns the path of the newest checkpoint.
     ///
     /// # Errors
@@ -153,7 +162,7 @@ impl Checkpoints {
         Ok(self.steps()?.pop())
     }
 
-    fn path_of(&self, step: u64) -> PathBuf {
+    pub(crate) fn path_of(&self, step: u64) -> PathBuf {
         self.folder.join(name_of(step))
     }
 
@@ -244,20 +253,8 @@ fn apply(
     train_state: &mut TrainState,
 ) -> Result<TrainingPosition, TrainError> {
     let bad = |name: &str, reason: String| bad(folder, name, reason);
-    let State { progress, model, loss_scale, .. } = state;
-    if let (Some(model), Some(expected)) = (&model, expected)
-        && *expected != (ModelConfig { patch_grids: expected.patch_grids, ..model.clone() })
-    {
-        let value = format!("{expected:?}");
-        return Err(crate::error::bad("model", value, &format!("{} is of the network {model:?}", folder.display())));
-    }
-    let record = ModuleRecord::load(folder.join(MODEL)).map_err(|error| bad(MODEL, error.to_string()))?;
-    let loaded = caught(&folder.join(MODEL), || train_state.model.clone().try_load_record(record))?;
-    let loaded = loaded.map_err(|error| bad(MODEL, format!("{error:?}")))?;
-    if let Some((name, dtype)) = first_not_f32(&loaded) {
-        return Err(bad(MODEL, format!("{name} is {dtype:?}, not F32")));
-    }
-    train_state.model = loaded;
+    train_state.model = apply_model(&state, folder, expected, train_state.model.clone())?;
+    let State { progress, loss_scale, .. } = state;
     let record = OptimizerRecord::load(folder.join(OPTIMIZER)).map_err(|error| bad(OPTIMIZER, error.to_string()))?;
     let num_tensors = record.len();
     let loaded = caught(&folder.join(OPTIMIZER), || train_state.optimizer.clone().load_record(record))?;
@@ -274,6 +271,29 @@ fn apply(
         train_state.loss_scale = loss_scale;
     }
     Ok(progress)
+}
+
+/// Loads the weights of a verified checkpoint into `model`.
+fn apply_model(
+    state: &State,
+    folder: &Path,
+    expected: Option<&ModelConfig>,
+    model: Clift,
+) -> Result<Clift, TrainError> {
+    let bad = |name: &str, reason: String| bad(folder, name, reason);
+    if let (Some(model), Some(expected)) = (&state.model, expected)
+        && *expected != (ModelConfig { patch_grids: expected.patch_grids, ..model.clone() })
+    {
+        let value = format!("{expected:?}");
+        return Err(crate::error::bad("model", value, &format!("{} is of the network {model:?}", folder.display())));
+    }
+    let record = ModuleRecord::load(folder.join(MODEL)).map_err(|error| bad(MODEL, error.to_string()))?;
+    let loaded = caught(&folder.join(MODEL), || model.try_load_record(record))?;
+    let loaded = loaded.map_err(|error| bad(MODEL, format!("{error:?}")))?;
+    if let Some((name, dtype)) = first_not_f32(&loaded) {
+        return Err(bad(MODEL, format!("{name} is {dtype:?}, not F32")));
+    }
+    Ok(loaded)
 }
 
 /// Returns a panic of `load` as an error. Burn 0.22 panics for integer tensors, for optimizer tensors without parameter ids,

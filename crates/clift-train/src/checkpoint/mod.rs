@@ -2,6 +2,8 @@
 //!
 //! - `progress`: state.json of a checkpoint
 //! - `checkpoints`: save, resume, keep the best
+//! - `newest`: the model of a run in training
 
 pub(crate) mod checkpoints;
+pub(crate) mod newest;
 pub(crate) mod progress;

@@ -28,7 +28,7 @@ impl Config {
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
         for settings in [Stage::Stage1, Stage::Stage2].map(|stage| self.stage(stage)) {
             let name = settings.stage.name();
-            in_range(&format!("{name}.batch_size"), settings.batch_size, 1, usize::MAX)?;
+            in_range(&format!("{name}.batch_size"), settings.batch_size, 1, 65_536)?;
             in_range(&format!("{name}.accumulate"), settings.accumulate, 1, settings.batch_size)?;
             settings.optimizer.validate().map_err(|error| error.in_section(&format!("{name}.optimizer")))?;
         }

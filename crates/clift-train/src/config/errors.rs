@@ -10,7 +10,7 @@ use serde::Serialize;
 use toml::de::{DeTable, DeValue};
 
 use crate::config::diagnostic::SourceText;
-use crate::config::schema::{Sections, join, nearest, quoted_names};
+use crate::config::schema::{Sections, join, nearest, quoted_names, related_key};
 use crate::error::TrainError;
 
 /// Finds every unknown key, in the order of the text.
@@ -47,7 +47,7 @@ fn unknown_key(sections: &Sections, section: &str, name: &str, is_section: bool)
         Some(near) if is_table => format!("did you mean [{near}]?"),
         Some(near) if is_section || elsewhere.is_empty() => format!("did you mean `{near}`?"),
         _ if !elsewhere.is_empty() => format!("`{name}` belongs to {}", elsewhere.join(" or ")),
-        _ => String::new(),
+        _ => related_key(name, section, sections).map_or_else(String::new, |key| format!("did you mean `{key}`?")),
     };
     (title, label, format!("help: {} has {}", owner_of(section), quoted(keys)))
 }
@@ -67,7 +67,8 @@ pub(crate) fn wrong_value(
     let Some(span) = span else { return sources.whole(message.to_owned()) };
     if let Some(variant) = between(message, "unknown variant `", "`") {
         let label = nearest(variant, quoted_names(message));
-        let label = label.map_or_else(String::new, |near| format!("did you mean \"{near}\"?"));
+        let other = if path == "device" { "every GPU is \"wgpu\"" } else { "" };
+        let label = label.map_or_else(|| other.into(), |near| format!("did you mean \"{near}\"?"));
         let allowed = quoted_names(message).map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ");
         let help = format!("help: it is one of {allowed}");
         return sources.at(span, format!("unknown value{of_path}"), label).with_note(help);
@@ -173,7 +174,7 @@ fn describe_found(got: &str) -> String {
     match got.split_once(' ') {
         Some(("string", text)) => format!("the string {text}"),
         Some(("integer" | "floating", number)) => {
-            format!("the number {}", number.trim_start_matches("point ").trim_matches('`'))
+            format!("the number {}", number.split('`').nth(1).unwrap_or(number))
         }
         Some(("boolean", value)) => value.trim_matches('`').to_owned(),
         _ if got == "sequence" => "a list".to_owned(),

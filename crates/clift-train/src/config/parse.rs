@@ -1,5 +1,7 @@
 //! Reads a configuration: a TOML file, then `--set key=TOML` overrides. Errors show the line with the mistake.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -12,6 +14,9 @@ use crate::config::errors;
 use crate::config::overrides::{Override, dotted, merge_value, parse_override, to_toml};
 use crate::config::schema::sections;
 use crate::error::TrainError;
+
+/// Most bytes of a config file.
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Errors of a configuration.
 #[derive(Debug, thiserror::Error)]
@@ -48,18 +53,6 @@ pub fn read_config<T: DeserializeOwned + Serialize>(
     read_checked_config(path, overrides, |_| Ok(()))
 }
 
-/// Does [`read_config`] on a text; `path` is only used in messages.
-///
-/// # Errors
-/// As [`read_config`].
-pub fn parse_config<T: DeserializeOwned + Serialize>(
-    path: &Path,
-    file: &str,
-    overrides: &[String],
-) -> Result<(T, Vec<Override>), ConfigError> {
-    parse_checked(path, file, overrides, |_| Ok(()))
-}
-
 /// Does [`read_config`], then calls `check` on the config.
 ///
 /// # Errors
@@ -69,11 +62,24 @@ pub fn read_checked_config<T: DeserializeOwned + Serialize>(
     overrides: &[String],
     check: impl FnOnce(&T) -> Result<(), TrainError>,
 ) -> Result<(T, Vec<Override>), ConfigError> {
-    let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
-    parse_checked(path, &file, overrides, check)
+    let file = read_text(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
+    parse_config(path, &file, overrides, check)
 }
 
-fn parse_checked<T: DeserializeOwned + Serialize>(
+/// Reads a file of at most [`MAX_BYTES`]; devices have no end.
+fn read_text(path: &Path) -> std::io::Result<String> {
+    let mut text = String::new();
+    if File::open(path)?.take(MAX_BYTES + 1).read_to_string(&mut text)? as u64 > MAX_BYTES {
+        return Err(std::io::Error::other(format!("the file has more than {MAX_BYTES} bytes and is not a config")));
+    }
+    Ok(text)
+}
+
+/// Does [`read_checked_config`] on a text; `path` is only used in messages.
+///
+/// # Errors
+/// As [`read_checked_config`].
+pub fn parse_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     file: &str,
     overrides: &[String],
@@ -139,7 +145,7 @@ mod tests {
 
     fn parse(file: &str, overrides: &[&str]) -> Result<(Config, Vec<String>), ConfigError> {
         let overrides: Vec<String> = overrides.iter().map(|&text| text.to_owned()).collect();
-        let (config, changed) = parse_config(Path::new("tiny.toml"), file, &overrides)?;
+        let (config, changed) = parse_config(Path::new("tiny.toml"), file, &overrides, |_| Ok(()))?;
         Ok((config, changed.iter().map(ToString::to_string).collect()))
     }
 
@@ -176,6 +182,13 @@ mod tests {
             assert_eq!(parse(&file, &[text]).unwrap().0.run_dir, Path::new(expected));
         }
         assert!(message(FILE, &["device="]).starts_with("the value of `device` is not TOML"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn devices_are_not_configs() {
+        let message = read_config::<Config>(Path::new("/dev/zero"), &[]).unwrap_err().to_string();
+        assert!(message.contains("more than 1048576 bytes and is not a config: /dev/zero"), "{message}");
     }
 
     #[test]

@@ -39,6 +39,24 @@ pub(crate) fn nearest<'a>(word: &str, candidates: impl Iterator<Item = &'a str>)
         .map(|(_, candidate)| candidate)
 }
 
+/// Returns the dotted key that another name may mean: one with the name as its initials, else one that shares a word. Keys of
+/// `section` come first, then those of the sections below it.
+pub(crate) fn related_key(name: &str, section: &str, sections: &Sections) -> Option<String> {
+    let words = |name: &str| -> Vec<String> {
+        name.split('_').filter(|word| !["", "min", "max", "num"].contains(word)).map(str::to_owned).collect()
+    };
+    let wanted = words(name);
+    let has_initials = |key: &str| key.split('_').filter_map(|word| word.chars().next()).eq(name.chars());
+    let shares_word = |key: &str| words(key).iter().any(|word| wanted.contains(word));
+    let near = |other: &str| (other != section, !other.starts_with(section));
+    let mut keys: Vec<(&str, &str)> =
+        sections.iter().flat_map(|(section, keys)| keys.iter().map(|key| (section.as_str(), key.as_str()))).collect();
+    keys.sort_by_key(|(section, _)| near(section));
+    let found =
+        keys.iter().find(|(_, key)| has_initials(key)).or_else(|| keys.iter().find(|(_, key)| shares_word(key)));
+    found.map(|(section, key)| join(section, key))
+}
+
 pub(crate) fn join(section: &str, key: &str) -> String {
     if section.is_empty() { key.to_owned() } else { format!("{section}.{key}") }
 }

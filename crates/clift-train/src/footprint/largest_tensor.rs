@@ -1,7 +1,7 @@
 //! Largest tensor of every part of a run; refuses tensors that a device cannot hold.
 
 use burn::tensor::Device;
-use clift_model::{Grouping, Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes};
+use clift_model::{Grouping, Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes, used_adapter};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
@@ -39,18 +39,19 @@ pub fn largest_tensor(config: &Config, run_step: RunStep) -> Result<LargestTenso
 
 /// Refuses a run with a tensor that the open device cannot hold.
 pub fn check_tensors(config: &Config, device: &Device, run_steps: &[RunStep]) -> Result<(), TrainError> {
-    max_tensor_bytes(device).map_or(Ok(()), |limit| check_tensor_limit(config, limit, run_steps))
+    let Some(limit) = max_tensor_bytes(device) else { return Ok(()) };
+    let name = used_adapter().map_or_else(|| config.device.to_string(), |adapter| adapter.to_string());
+    check_tensor_limit(config, (&name, limit), run_steps)
 }
 
-fn check_tensor_limit(config: &Config, limit: u64, run_steps: &[RunStep]) -> Result<(), TrainError> {
+fn check_tensor_limit(config: &Config, (device, limit): (&str, u64), run_steps: &[RunStep]) -> Result<(), TrainError> {
     for &run_step in run_steps {
         let LargestTensor { what, bytes, .. } = largest_tensor(config, run_step)?;
         if bytes > limit {
             let (key, value, fix) = largest_fitting_setting(config, run_step, limit)?;
             let of = if run_step == RunStep::Eval { "the evaluation" } else { run_step.name() };
             let fix = format!(
-                "{what} of {of} would be one tensor of {bytes} bytes, and {} takes at most {limit} in one: {fix}",
-                config.device
+                "{what} of {of} would be one tensor of {bytes} bytes, and {device} takes at most {limit} in one: {fix}"
             );
             return Err(bad(&key, value, &fix));
         }
@@ -211,19 +212,19 @@ mod tests {
     fn refusal_names_the_micro_batch_that_fits() {
         let config = paper();
         let limit = (1 << 31) - 4;
-        let message = check_tensor_limit(&config, limit, config.run_steps()).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, ("wgpu", limit), config.run_steps()).unwrap_err().to_string();
         // 64 scenes x 6 views at once; of 9 scenes it is 2.04e9 bytes, so 8 parts fit.
         let bytes = 64_u64 * 6 * 6143 * 2 * 768 * 4;
         let expected = format!(
             "`stage1.accumulate` = 1: the keys and values of the renderer's tokens of stage1 would be one tensor of \
-             {bytes} bytes, and flex takes at most {limit} in one: write 8"
+             {bytes} bytes, and wgpu takes at most {limit} in one: write 8"
         );
         assert_eq!(message, expected);
         let mut fitting = config.clone();
         fitting.stage1.accumulate = 8;
-        check_tensor_limit(&fitting, limit, &[Stage::Stage1.into()]).expect("the value of the message");
+        check_tensor_limit(&fitting, ("wgpu", limit), &[Stage::Stage1.into()]).expect("the value of the message");
         fitting.stage1.accumulate = 7;
-        assert!(check_tensor_limit(&fitting, limit, &[Stage::Stage1.into()]).is_err(), "and no less");
+        assert!(check_tensor_limit(&fitting, ("wgpu", limit), &[Stage::Stage1.into()]).is_err(), "and no less");
     }
 
     #[test]
@@ -232,10 +233,10 @@ mod tests {
         config.stage1.accumulate = 64;
         // 6 x 5,119 x 2 x 768 values of five contexts.
         let limit = 6 * 5119 * 2 * 768 * 4;
-        let message = check_tensor_limit(&config, limit, &[Stage::Stage1.into()]).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, ("wgpu", limit), &[Stage::Stage1.into()]).unwrap_err().to_string();
         assert!(message.starts_with("`data.views.max_context` = 6:"), "{message}");
         assert!(message.ends_with("write 5 with stage1.accumulate = 64, or choose smaller images"), "{message}");
-        let message = check_tensor_limit(&config, 1000, &[RunStep::Eval]).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, ("wgpu", 1000), &[RunStep::Eval]).unwrap_err().to_string();
         assert!(message.starts_with("`data.width, data.height` = 256, 256:"), "{message}");
         check_tensors(&config, &Device::flex(), config.run_steps()).expect("memory alone is a CPU's limit");
     }

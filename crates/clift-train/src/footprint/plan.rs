@@ -82,6 +82,29 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
     })
 }
 
+/// Estimates the seconds that a run takes after a step of a stage with the time `step_s`: the later work, in the
+/// multiply-accumulates of the plan, at the pace of this step. Parts whose number of scenes depends on the data do not count.
+///
+/// # Errors
+/// As [`plan`].
+pub fn remaining_s(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: f64) -> Result<f64, TrainError> {
+    let plan = plan(config, num_ranks)?;
+    let settings = config.stage(stage);
+    let (batch_size, _) = scenes_of_rank(config, stage, num_ranks);
+    let gmacs = |config: &Config| Ok::<f64, TrainError>(batch_size as f64 * mean_macs_of_scene(config, stage)? / 1e9);
+    let whole = gmacs(config)?;
+    let num_half = settings.half_resolution_steps.saturating_sub(step) as f64;
+    let half = if settings.half_resolution_steps == 0 {
+        whole
+    } else {
+        gmacs(&Config { data: config.data.at_half_resolution(), ..config.clone() })?
+    };
+    let mut later = num_half * half + (settings.steps.saturating_sub(step) as f64 - num_half) * whole;
+    let parts = plan.parts.iter().skip_while(|part| part.part != stage.name()).skip(1);
+    later += parts.map(|part| part.count.unwrap_or_default() as f64 * part.gmacs).sum::<f64>();
+    Ok(step_s * later / if settings.is_half_resolution(step) { half } else { whole })
+}
+
 /// Does [`Config::validate`] and [`Config::validate_half_resolution`] without requiring `data.root`.
 ///
 /// # Errors
@@ -247,6 +270,25 @@ mod tests {
         assert!(plan.parts.iter().all(|part| part.gmacs > 0.0 && part.peak_bytes > 300 << 20));
         assert_eq!(plan.parameters.encoder + plan.parameters.renderer, 81_239_232);
         assert_eq!((plan.parts[0].count, plan.parts[1].count), (Some(90_000), None));
+    }
+
+    #[test]
+    fn the_time_left_is_that_of_the_later_work() {
+        let mut config = config();
+        (config.stage1.steps, config.clusters.num_scenes, config.eval.num_scenes) = (100, 1, 2);
+        let parts = plan(&config, 1).expect("valid").parts;
+        let gmacs = |i: usize| parts[i].count.expect("known") as f64 * parts[i].gmacs;
+        let step = parts[0].gmacs;
+        let assert_left = |config: &Config, stage, step, gmacs: f64| {
+            let left = remaining_s(config, 1, stage, step, 2.0).expect("valid");
+            assert!((left / (2.0 * gmacs) - 1.0).abs() < 1e-9, "{left} {gmacs}");
+        };
+        assert_left(&config, Stage::Stage1, 0, (gmacs(0) + gmacs(1) + gmacs(2) + gmacs(3)) / step);
+        assert_left(&config, Stage::Stage2, config.stage2.steps, gmacs(3) / parts[2].gmacs);
+        config.stage1.half_resolution = 0.5;
+        let half = 2.0 * plan(&config, 1).expect("valid").parts[0].gmacs - step;
+        assert_left(&config, Stage::Stage1, 40, 10.0 + (50.0 * step + gmacs(1) + gmacs(2) + gmacs(3)) / half);
+        assert_left(&config, Stage::Stage1, 60, 40.0 + (gmacs(1) + gmacs(2) + gmacs(3)) / step);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_model::{Clift, ModelPath, check_condenser, check_sizes, load_part, refuse_checkpoint};
+use clift_model::{Clift, ModelPath, check_condenser, check_sizes, find_shipped, load_part, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};
 use crate::error::TrainError;
@@ -11,7 +11,7 @@ use crate::events::{Event, Sink, Stage};
 use crate::stage::interpolation::interpolate;
 
 /// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
-/// the same stage of another run, from a model directory or from a weight file. Reports which parameters were loaded.
+/// the same stage of another run, from a model directory, a weight file or the [shipped model](find_shipped). Reports which parameters were loaded.
 pub(crate) fn init_from(
     mut model: Clift,
     config: &Config,
@@ -26,7 +26,8 @@ pub(crate) fn init_from(
         (&config.stage2.init_from, Clift::condenser_part(), "weight file for stage2.init_from", lack)
     };
     let Some(from) = from else { return Ok(model) };
-    let in_folder = [from.join(stage.name()), from.clone()].map(|folder| folder.join("model.safetensors"));
+    let from = &*find_shipped(from)?;
+    let in_folder = [from.join(stage.name()), from.into()].map(|folder| folder.join("model.safetensors"));
     let [run, _] = &in_folder;
     let path: &Path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     refuse_checkpoint(path)?;

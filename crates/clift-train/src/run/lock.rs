@@ -16,6 +16,8 @@ pub(crate) enum LockedFolder {
     Run,
     /// The directory of a run that is evaluated into it.
     EvaluatedRun,
+    /// The directory of a run whose codec is fitted.
+    FittedRun,
     /// The output folder of an evaluation.
     Evaluation,
 }
@@ -26,6 +28,7 @@ impl LockedFolder {
         match self {
             Self::Run => ("run directory", "another `run_dir`"),
             Self::EvaluatedRun => ("run directory", "an --out outside of it"),
+            Self::FittedRun => ("run directory", "another model"),
             Self::Evaluation => ("output folder", "another --out"),
         }
     }
@@ -68,7 +71,7 @@ impl RunLock {
     ///
     /// # Errors
     /// [`TrainError::Locked`] if another process has the lock, [`TrainError::Io`] if the file cannot be opened.
-    pub fn take(folder: &Path, kind: LockedFolder, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+    pub(crate) fn take(folder: &Path, kind: LockedFolder, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         let path = folder.join(LOCK);
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
         let mut file = opened.map_err(TrainError::io("opening the lock of the folder", &path))?;

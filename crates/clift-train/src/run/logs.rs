@@ -239,6 +239,8 @@ mod tests {
         lr: 1e-3,
         grad_norm: 2.0,
         step_s: 0.25,
+        images_per_s: 48.0,
+        peak_bytes: None,
     };
 
     #[derive(Default)]
@@ -295,7 +297,7 @@ mod tests {
         let (line, time) = text.split_once(",\"time\":").unwrap();
         assert_eq!(
             line,
-            "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25"
+            "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25,\"images_per_s\":48.0,\"peak_bytes\":null"
         );
         let time: f64 = time.trim_end_matches("}\n").parse().unwrap();
         assert!((now() - time).abs() < 60.0, "{time}");

@@ -152,10 +152,10 @@ impl Run {
         self.report_opening(Split::Train, sink);
         let mut progress = |done, total| sink.event(&Event::Scan { done, total });
         let opened = open_training_dataset(&self.config.data, self.config.last_gap_step(), &mut progress)?;
-        let is_divided = opened.kind != SourceKind::Synthetic && !opened.shares_scenes && self.overfit.is_none();
+        let is_divided = self.is_divided(&opened);
         let reader = self.reader(opened, Split::Train, sink)?;
-        let validation = self.validation(Split::Test, sink)?;
-        if is_divided && let Some(warning) = validation.warn_of_training_scenes(reader.source.as_ref()) {
+        let mut validation = self.validation(Split::Test, sink)?;
+        if is_divided && let Some(warning) = validation.mark_training_scenes(reader.source.as_ref()) {
             sink.event(&Event::Warning(warning));
         }
         let train_stage2 = wanted(Stage::Stage2) && !has_stage2;
@@ -221,7 +221,23 @@ impl Run {
             }
             models.set_stage2(other.clusters.grouping, open_stage2(other, &models.stage1)?);
         }
-        self.validation(request.split, sink)?.evaluate(&models, request, &self.ranks, stop, sink)
+        let mut validation = self.validation(request.split, sink)?;
+        if request.split == Split::Test && self.is_training_data {
+            let mut progress = |done, total| sink.event(&Event::Scan { done, total });
+            let training = open_training_dataset(&self.config.data, self.config.last_gap_step(), &mut progress);
+            // The training split need not be on this machine.
+            if let Some(training) = training.ok().filter(|opened| self.is_divided(opened))
+                && let Some(warning) = validation.mark_training_scenes(training.source.as_ref())
+            {
+                sink.event(&Event::Warning(warning));
+            }
+        }
+        validation.evaluate(&models, request, &self.ranks, stop, sink)
+    }
+
+    /// Whether training and test scenes of files are lists of their own, which should have no scene in common.
+    fn is_divided(&self, opened: &OpenedSource) -> bool {
+        opened.kind != SourceKind::Synthetic && !opened.shares_scenes && self.overfit.is_none()
     }
 
     /// Opens the trained models of both stages, or of stage 1 only.

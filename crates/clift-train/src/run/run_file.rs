@@ -132,6 +132,15 @@ pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn 
     Ok(lock)
 }
 
+/// Locks the run that `path` is, or is the stage folder or the weight file of; `None` for other models.
+///
+/// # Errors
+/// As [`RunLock::take`].
+pub fn lock_run(path: &Path, sink: &mut dyn Sink) -> Result<Option<RunLock>, TrainError> {
+    let run = path.ancestors().take(3).find(|folder| folder.join(FILE).is_file());
+    run.map(|folder| RunLock::take(folder, LockedFolder::FittedRun, sink)).transpose()
+}
+
 /// Checks that a run directory is still at its path: a process that has it open must not make a second one there.
 ///
 /// # Errors

@@ -222,6 +222,8 @@ impl<'a> TrainLoop<'a> {
     }
 
     fn report(&mut self, update: Update, lr: f64, started: Instant) {
+        let step_s = started.elapsed().as_secs_f64();
+        let num_images = self.plan.settings.batch_size * self.plan.config.data.views.num_targets;
         self.log.event(&Event::Step(StepEvent {
             stage: self.plan.settings.stage,
             step: self.progress.step,
@@ -231,7 +233,9 @@ impl<'a> TrainLoop<'a> {
             psnr: psnr_of_mse(update.mse),
             lr,
             grad_norm: update.grad_norm,
-            step_s: started.elapsed().as_secs_f64(),
+            step_s,
+            images_per_s: num_images as f64 / step_s.max(1e-9),
+            peak_bytes: peak_bytes(),
         }));
     }
 

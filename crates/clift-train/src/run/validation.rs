@@ -6,10 +6,10 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, SceneSource, Split, plural};
+use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::{
     EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, RunDescription, SceneFigures,
-    SceneLimits, Summary, Sweep,
+    SceneLimits, Summary, Sweep, training_scenes_note,
 };
 use clift_model::{Clift, TokenCount, TrainedModel};
 use clift_scene::TokenCoding;
@@ -72,15 +72,12 @@ impl<'a> Validation<'a> {
         Ok(Self { config, evaluator })
     }
 
-    /// Returns a warning that names evaluated scenes with the keys of training scenes, if there are some.
-    pub fn warn_of_training_scenes(&self, training: &dyn SceneSource) -> Option<String> {
+    /// Marks the evaluated scenes that have the keys of training scenes, for the report; returns a warning if there are some.
+    pub fn mark_training_scenes(&mut self, training: &dyn SceneSource) -> Option<String> {
         let keys: HashSet<&str> = (0..training.num_scenes()).map(|scene| training.key(scene)).collect();
-        let shared: Vec<&str> = self.evaluator.keys().filter(|key| keys.contains(key)).collect();
-        let first = shared.first()?;
-        Some(format!(
-            "the evaluation shares {} with training, such as {first}: the results are not of held-out scenes",
-            plural(shared.len(), "scene"),
-        ))
+        self.evaluator.training_scenes =
+            self.evaluator.keys().filter(|key| keys.contains(key)).map(str::to_owned).collect();
+        training_scenes_note(&self.evaluator.training_scenes)
     }
 
     /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with

@@ -89,8 +89,8 @@ export class Controls {
     const isField = event.target.closest?.("input:not([type=range]), select, textarea, dialog");
     if (isField || event.ctrlKey || event.metaKey || event.altKey) return;
     const key = event.key.toLowerCase();
-    // Arrows move a slider in focus.
-    if (event.target.matches?.("input[type=range]") && LOOKS[key]) return;
+    // Arrows move a slider in focus, and choose a radio button.
+    if (event.target.matches?.("input[type=range], [role=radio]") && LOOKS[key]) return;
     this.isFast = event.shiftKey;
     if (!MOVES[key] && !LOOKS[key]) return;
     event.preventDefault();

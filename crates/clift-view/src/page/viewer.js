@@ -404,6 +404,17 @@ function bindSegments(id, current, onChange) {
   $(id).onclick = ({ target }) => {
     if (target.dataset.value) chooseSegment(id, target.dataset.value);
   };
+  // Arrows choose the next radio button, as in a radio group of the browser; Tab reaches the chosen one.
+  $(id).onkeydown = (event) => {
+    const turn = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+    const buttons = [...$(id).children];
+    const at = buttons.indexOf(event.target);
+    if (!turn || at < 0 || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    const next = buttons[(at + turn + buttons.length) % buttons.length];
+    next.focus();
+    chooseSegment(id, next.dataset.value);
+  };
   $(id).choose = onChange;
   mark(id, current);
 }
@@ -414,7 +425,11 @@ function chooseSegment(id, value) {
 }
 
 function mark(id, value) {
-  for (const button of $(id).children) button.setAttribute("aria-checked", button.dataset.value === value);
+  for (const button of $(id).children) {
+    const isChosen = button.dataset.value === value;
+    button.setAttribute("aria-checked", isChosen);
+    button.tabIndex = isChosen ? 0 : -1;
+  }
 }
 
 function notice(text, forMs) {

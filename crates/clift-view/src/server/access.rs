@@ -2,7 +2,8 @@
 //!
 //! The URL of the page has a random token, which the first answer turns into a cookie of the same site. Every request needs
 //! one of the two. The Host header must name an IP address or `localhost`: a page that rebinds the DNS name of its own
-//! server to this address sends that name. A WebSocket must come from this origin.
+//! server to this address sends that name. There is one such header, and a request with an absolute URI names the same host: programs
+//! in between could read another one. A WebSocket must come from this origin.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -59,8 +60,10 @@ impl Access {
 
     /// Checks a request; returns whether it has the token in its URL.
     pub fn check(&self, uri: &Uri, headers: &HeaderMap, is_socket: bool) -> Result<bool, Refusal> {
-        let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).ok_or(Refusal::Host)?;
-        if !self.is_own_host(host) {
+        let mut hosts = headers.get_all(header::HOST).iter();
+        let (Some(host), None) = (hosts.next(), hosts.next()) else { return Err(Refusal::Host) };
+        let host = host.to_str().map_err(|_| Refusal::Host)?;
+        if !self.is_own_host(host) || uri.authority().is_some_and(|authority| authority.as_str() != host) {
             return Err(Refusal::Host);
         }
         let origin = headers.get(header::ORIGIN).map(|origin| origin.to_str().unwrap_or_default());
@@ -152,6 +155,16 @@ mod tests {
         assert_eq!(host(&open, "192.168.0.7:4000"), Ok(true));
         assert_eq!(host(&open, "evil.example:4000"), Err(Refusal::Host));
         assert_eq!(check(&open, "/", &[], false), Err(Refusal::Host));
+        let own = ("host", "localhost:4000");
+        for (uri, headers, refused) in [
+            ("/", [own, own].as_slice(), true),
+            ("/", &[own, ("host", "evil.example")], true),
+            ("http://evil.example/", &[own], true),
+            ("http://localhost:4000/", &[own], false),
+        ] {
+            let is_refused = check(&loopback, uri, headers, false) == Err(Refusal::Host);
+            assert_eq!(is_refused, refused, "{uri} {headers:?}");
+        }
     }
 
     #[test]

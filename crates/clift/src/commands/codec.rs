@@ -3,15 +3,15 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clift_data::{ClipReader, Split};
+use clift_data::{ClipReader, Split, plural};
 use clift_eval::{EvalFrames, EvalSplit, table};
 use clift_scene::{FittedCodec, TokenCodec};
-use clift_train::fit_token_codec;
+use clift_train::{fit_token_codec, lock_run};
 
 use crate::commands::args::model_args::ModelArgs;
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::output_file::OutputFile;
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::print_result;
@@ -36,6 +36,9 @@ pub struct CodecArgs {
 
 /// Fits the codec of a model and prints its rates.
 pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
+    let mut sink = progress_sink();
+    // A run in training writes its codec itself.
+    let _lock = lock_run(&args.model, sink.as_mut())?;
     let model_args = ModelArgs::new(&args.model, args.data.as_deref(), &args.overrides)?;
     let ModelArgs { path, config, .. } = &model_args;
     let out = TokenCodec::path_of(&path.weights);
@@ -46,8 +49,7 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     let model = model_args.open()?;
     let frames = EvalFrames { split: EvalSplit::Train, hold_out };
-    let mut sink = progress_sink();
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let fitted = fit_token_codec(config, (&model, &path.weights), (&reader, frames), &stop, sink.as_mut())?;
     drop(sink);
     print_result(&describe(&fitted, &out.display().to_string()))
@@ -76,8 +78,9 @@ fn describe(fitted: &FittedCodec, path: &str) -> String {
         [format!("{step:.4}"), format!("{stream:.4}"), format!("{entropy:.4}"), above]
     });
     format!(
-        "{path}: fitted on {num_scenes} scenes, {num_values} values measured\n{}\n\nbits a value of the streams, and the \
+        "{path}: fitted on {}, {num_values} values measured\n{}\n\nbits a value of the streams, and the \
          entropy of the levels by direction\n{}",
+        plural(*num_scenes, "scene"),
         table(header, rows),
         table(["step", "stream", "entropy", "above"], bounds),
     )

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clift_eval::{Comparison, Evaluation, MethodFilter};
 
-use crate::commands::args::parse::parse_methods;
+use crate::commands::args::parse::{parse_input, parse_methods};
 use crate::commands::args::shared_args::JsonArg;
 use crate::output::stdout::print_result;
 
@@ -18,9 +18,11 @@ pub fn run(args: &CompareArgs) -> anyhow::Result<()> {
 
 #[derive(Debug, clap::Args)]
 pub struct CompareArgs {
-    /// First evaluation
+    /// First evaluation: a run, the folder of an evaluation or its views.csv
+    #[arg(value_parser = parse_input)]
     pub a: PathBuf,
     /// Second evaluation
+    #[arg(value_parser = parse_input)]
     pub b: PathBuf,
     /// Compare method A of the first with method B of the second, at equal counts
     #[arg(long, value_name = "A,B", value_parser = parse_methods)]

@@ -9,10 +9,10 @@ use clift_scene::TokenCoding;
 use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
 
 use crate::commands::args::model_args::check_network;
-use crate::commands::args::parse::{parse_bytes, parse_split};
+use crate::commands::args::parse::{parse_bytes, parse_run, parse_split};
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::{print_evaluation, print_warning};
 
@@ -44,7 +44,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         );
     }
     let mut sink = progress_sink();
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let folder = EvalFolder::open(&out, args.force, sink.as_mut())?;
     let request = EvalRequest { split: args.split, external: &external, folder: &folder };
     let summary = match &model {
@@ -114,7 +114,7 @@ fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
     /// Run directory
-    #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint")]
+    #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint", value_parser = parse_run)]
     pub run: Option<PathBuf>,
     /// Evaluate a model directory (from `clift import`) instead of a run
     #[arg(long, value_name = "MODEL", requires = "data")]
@@ -136,7 +136,7 @@ pub struct EvalArgs {
     ///
     /// Runs with `model.architecture = "lvsm-ed"` are trained on their own and have distinct numbers of latents. The
     /// option is repeatable: `clift eval RUN --preset main --with runs/lvsm-64 --with runs/lvsm-16` is the paper's main figure.
-    #[arg(long, value_name = "RUN", conflicts_with = "checkpoint")]
+    #[arg(long, value_name = "RUN", conflicts_with = "checkpoint", value_parser = parse_run)]
     pub with: Vec<PathBuf>,
     /// Stored token counts, as numbers or shares, e.g. 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]

@@ -6,7 +6,7 @@ use clift_model::CliftVariant;
 use clift_train::{ImportOptions, ImportRecord, import};
 
 use crate::commands::args::parse::parse_rename;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::stdout::print_result;
 
 #[derive(Debug, clap::Args)]
@@ -40,7 +40,7 @@ pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
         convert: args.convert,
         renames: args.rename.clone(),
     };
-    let (config, record) = import(&args.file, &args.out, &options, &*interrupt::flag()?)?;
+    let (config, record) = import(&args.file, &args.out, &options, &*interrupt::flag(Ending::WITHOUT_RESULTS)?)?;
     let model = &config.model;
     let mut lines: Vec<String> =
         record.parameters.iter().map(|(key, paths)| format!("{key} -> {}", paths.join(", "))).collect();

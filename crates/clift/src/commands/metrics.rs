@@ -8,6 +8,7 @@ use anyhow::Context;
 use clift_train::Stage;
 use serde::Deserialize;
 
+use crate::commands::args::parse::parse_run;
 use crate::exit_code::usage_bail;
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
@@ -16,12 +17,14 @@ use crate::output::tensorboard::{Scalar, event_file};
 /// Stages with curves.
 const STAGES: [Stage; 2] = [Stage::Stage1, Stage::Stage2];
 /// Columns of the CSV with their TensorBoard tags: keys of `metrics.jsonl`, then those of `validation.jsonl` with a prefix.
-const CURVES: [(&str, Option<&str>); 8] = [
+const CURVES: [(&str, Option<&str>); 10] = [
     ("loss", Some("train/loss")),
     ("psnr", Some("train/psnr")),
     ("lr", Some("train/learning_rate")),
     ("grad_norm", Some("train/grad_norm")),
     ("step_s", Some("train/step_s")),
+    ("images_per_s", Some("train/images_per_s")),
+    ("peak_bytes", Some("train/peak_bytes")),
     ("validation_psnr", Some("validation/psnr")),
     ("validation_ssim", Some("validation/ssim")),
     ("validation_num_views", None),
@@ -79,7 +82,8 @@ fn read_rows(run: &Path) -> anyhow::Result<Rows> {
         if !is_step && !path.exists() {
             continue;
         }
-        let text = std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("reading {}, which the first step writes", path.display()))?;
         // A run that is training may have written a part of its last line.
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
         for (number, line) in whole.lines().enumerate() {
@@ -123,6 +127,7 @@ fn scalars(rows: &Rows, stage: Stage) -> impl Iterator<Item = Scalar<'static>> {
 #[derive(Debug, clap::Args)]
 pub struct MetricsArgs {
     /// Run directory, also of a run that is training
+    #[arg(value_parser = parse_run)]
     pub run: PathBuf,
     /// Write a row per step, with the validation of the step
     #[arg(long, value_name = "FILE")]
@@ -146,7 +151,7 @@ mod tests {
         let step = |step: u64, loss: &str| {
             format!(
                 "{{\"step\":{step},\"stage\":\"stage1\",\"loss\":{loss},\"psnr\":20.5,\"lr\":0.001,\"grad_norm\":2.0,\
-                 \"step_s\":0.25,\"time\":100.5}}\n"
+                 \"step_s\":0.25,\"images_per_s\":48.0,\"time\":100.5}}\n"
             )
         };
         write("metrics.jsonl", &(step(1, "0.5") + &step(2, "null") + "{\"step\":3,\"sta"));
@@ -156,9 +161,9 @@ mod tests {
         );
         let rows = read_rows(folder.path()).unwrap();
         let expected = "\
-stage,step,time,loss,psnr,lr,grad_norm,step_s,validation_psnr,validation_ssim,validation_num_views
-stage1,1,100.5,0.5,20.5,0.001,2,0.25,,,
-stage1,2,100.5,,20.5,0.001,2,0.25,18,,6
+stage,step,time,loss,psnr,lr,grad_norm,step_s,images_per_s,peak_bytes,validation_psnr,validation_ssim,validation_num_views
+stage1,1,100.5,0.5,20.5,0.001,2,0.25,48,,,,
+stage1,2,100.5,,20.5,0.001,2,0.25,48,,18,,6
 ";
         assert_eq!(String::from_utf8(csv(&rows)).unwrap(), expected);
         let scalars: Vec<_> = scalars(&rows, Stage::Stage1).collect();

@@ -6,6 +6,7 @@ use clift_eval::table;
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PartPlan, Plan, check_plan, largest_tensor, memory_warning, plan};
 
+use crate::commands::args::adapter::name_adapter;
 use crate::commands::args::parse::parse_count;
 use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 use crate::output::stdout::{print_result, print_warning};
@@ -14,6 +15,7 @@ use crate::output::units::{file_size, memory_size};
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let json = args.json.open(&[&args.config])?;
     let config = args.overrides.read(&args.config, check_plan)?;
+    name_adapter(config.device, false);
     let plan = plan(&config, args.ranks)?;
     print_result(&report_text(&plan))?;
     print_result(&largest_tensors(&config)?)?;

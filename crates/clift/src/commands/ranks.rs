@@ -4,8 +4,8 @@ use std::rc::Rc;
 
 use clift_train::{Launched, RankPlace, Ranks, TrainError};
 
-use crate::output::verbosity::Verbosity;
 use crate::threads;
+use crate::verbosity::Verbosity;
 
 /// Connects the processes of a launcher, and gives each its share of the cores. From now on only rank 0 prints.
 pub fn connect() -> Result<Rc<Ranks>, TrainError> {

@@ -4,14 +4,18 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 use clift_eval::available_bytes;
-use clift_train::{BatchParts, Config, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning};
+use clift_train::{
+    BatchParts, Config, Event, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning, remaining_s,
+};
 
+use crate::commands::args::adapter::name_adapter;
 use crate::commands::args::parse::{parse_count, parse_training_step};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::ranks::{connect, finish};
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::progress_sink::progress_sink;
 use crate::output::stdout::{print_run, print_warning};
+use crate::output::units::duration;
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let ranks = connect()?;
@@ -29,12 +33,24 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     if let Ok(Some(warning)) = memory_warning(&of_rank, available_bytes(config.device)) {
         print_warning(warning);
     }
-    let stop = interrupt::flag()?;
+    name_adapter(config.device, true);
+    let stop = interrupt::flag(Ending::RUN)?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = progress_sink();
+    let (planned, num_ranks) = (config.clone(), ranks.num_ranks());
+    // The first measured steps tell the time of the later stages, too.
+    let mut sink = move |event: &Event| {
+        sink.event(event);
+        if let (Event::Pace { stage, step, step_s, .. }, None) = (event, args.only)
+            && let Ok(left_s) = remaining_s(&planned, num_ranks, *stage, *step, *step_s)
+        {
+            let text = format!("all stages and the evaluation: about {} left", duration(left_s));
+            sink.event(&Event::Message(text));
+        }
+    };
     let (run_dir, supports_clusters) = (config.run_dir.clone(), config.model.architecture.supports_clusters());
-    let run = Run::open_on(ranks.clone(), config, &options, sink.as_mut())?;
-    let summary = run.train(args.only, &stop, sink.as_mut())?;
+    let run = Run::open_on(ranks.clone(), config, &options, &mut sink)?;
+    let summary = run.train(args.only, &stop, &mut sink)?;
     drop(sink);
     summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, supports_clusters))
 }

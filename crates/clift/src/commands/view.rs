@@ -6,11 +6,11 @@ use std::process::{Command, Stdio};
 
 use clift_data::{ClipReader, SkipReport, Split};
 use clift_eval::{EvalFrames, evaluation_items};
-use clift_model::{DeviceName, ModelConfig};
+use clift_model::{DeviceName, ModelConfig, is_shipped};
 use clift_scene::{ContextChoice, Contexts, EncodeOptions, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
-use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
+use crate::commands::args::model_args::{ModelArgs, default_model, is_data};
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::render::run::scene_weights;
@@ -24,7 +24,8 @@ const MAX_SCENES: usize = 200;
 pub struct ViewArgs {
     /// Scene file; run or model, whose test scenes are listed; or photos [default: models/rooms]
     ///
-    /// Photos are encoded with models/rooms, which ships with clift, or with the model that `CLIFT_MODEL` names.
+    /// Of a run in training, the newest checkpoint renders. Photos are encoded with models/rooms, which ships with clift, or with
+    /// the model that `CLIFT_MODEL` names.
     #[arg(value_name = "SCENE|RUN|DIR")]
     pub scene: Option<PathBuf>,
     /// Capture or data set in any layout [default: the data of the run]
@@ -51,8 +52,11 @@ pub struct ViewArgs {
 
 /// Serves scenes until the process ends.
 pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
-    let scene = args.scene.clone().map_or_else(shipped_model, Ok)?;
-    let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene);
+    let scene = args.scene.clone().unwrap_or_else(default_model);
+    let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene) || is_shipped(&scene);
+    if !is_run && !scene.exists() {
+        usage_bail!("{}: no such file or folder", scene.display());
+    }
     let (scenes, device) = if is_run { open_run(&scene, args)? } else { open_file(&scene, args)? };
     let server = ViewServer::bind((args.listen, args.port).into())?;
     let (url, port) = (server.url(), server.address().port());
@@ -96,7 +100,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     if args.model.is_some() {
         usage_bail!("--model is for scene files, {} is a folder; write `clift view RUN DIR`", scene.display());
     }
-    let model_args = ModelArgs::find(scene, args.data.as_deref(), &args.overrides)?;
+    let model_args = ModelArgs::find_newest(scene, args.data.as_deref(), &args.overrides)?;
     let opened = model_args.open_data(args.split)?;
     let model = model_args.open()?;
     require_places(&model_args.config.model, &model_args.given)?;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-use crate::output::event_line::{event_line, step_metrics, time_left};
+use crate::output::event_line::{event_line, image_rate, step_metrics, time_left};
 use crate::output::stdout::print_note;
 use crate::output::units::rate;
 use crate::output::visible::visible;
@@ -14,6 +14,8 @@ use crate::output::visible::visible;
 #[derive(Default)]
 pub struct Bar {
     bar: Option<ProgressBar>,
+    /// Whether the bar has shown no step.
+    is_new: bool,
 }
 
 impl Sink for Bar {
@@ -29,6 +31,7 @@ impl Sink for Bar {
                 None => print_note(&line),
             }
         }
+        self.is_new |= matches!(event, Event::StepStarted { .. } | Event::ImageSize { .. });
         match (event, &self.bar) {
             (Event::StepStarted { run_step, done, num_steps }, _) => {
                 self.bar = Some(progress_bar(run_step.name(), *done, *num_steps));
@@ -38,8 +41,12 @@ impl Sink for Bar {
                 self.bar = Some(progress_bar_to(*last_step_of_size, stage.name(), *done, *last_step));
             }
             (Event::Step(step), Some(bar)) => {
-                bar.set_message(step_metrics(step));
+                // The first step may compile kernels: its time is no pace.
+                bar.set_message(format!("{}  {}", step_metrics(step), image_rate(step.images_per_s)));
                 bar.set_position(step.step);
+                if std::mem::take(&mut self.is_new) {
+                    bar.reset_eta();
+                }
             }
             (Event::Progress { done, .. }, Some(bar)) => bar.set_position(*done),
             _ => {}
@@ -47,9 +54,9 @@ impl Sink for Bar {
     }
 }
 
-// Everything up to the message fits 80 columns. The message is cut at the end of the line: a wrapped bar would leave
-// copies of itself behind.
-const TEMPLATE: &str = "{prefix} {bar:16.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
+// Everything up to the loss fits 80 columns. The message is cut at the end of the line: a wrapped bar would leave copies of
+// itself behind.
+const TEMPLATE: &str = "{prefix} {bar:8.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
 
 pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
     progress_bar_to(total, name, done, total)
@@ -111,6 +118,6 @@ mod tests {
     fn no_time_left_before_the_first_step() {
         assert_eq!(pace(0.0, 0, 60, 100), "");
         assert_eq!(pace(0.125, 50, 60, 60), "  8.0 s each, 1 min 20 s left");
-        assert_eq!(pace(0.125, 50, 60, 100), "  8.0 s each, 1 min 20 s to step 60");
+        assert_eq!(pace(0.125, 50, 60, 100), "  8.0 s each, 1 min 20 s to 60");
     }
 }

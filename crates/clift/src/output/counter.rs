@@ -8,8 +8,8 @@ use indicatif::ProgressBar;
 use crate::output::bar::progress_bar;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
-use crate::output::verbosity::Verbosity;
 use crate::output::visible::visible;
+use crate::verbosity::Verbosity;
 
 const INTERVAL_S: f64 = 10.0;
 

@@ -4,7 +4,6 @@
 //! - `visible`: control characters escaped
 //! - `output_file`: files that are written, checked beforehand
 //! - `tensorboard`: event files
-//! - `verbosity`: `--quiet` and `--verbose`
 //! - `stdout`: results to stdout, notes to stderr
 //! - `event_line`: an event as one line
 //! - `plain`: progress lines for log files
@@ -21,5 +20,4 @@ pub(crate) mod progress_sink;
 pub(crate) mod stdout;
 pub(crate) mod tensorboard;
 pub(crate) mod units;
-pub(crate) mod verbosity;
 pub(crate) mod visible;

@@ -4,7 +4,7 @@ use std::io::Write;
 
 use clift_train::{Event, Sink, StepEvent};
 
-use crate::output::event_line::{event_line, step_metrics, time_left};
+use crate::output::event_line::{event_line, image_rate, step_metrics, time_left};
 use crate::output::visible::visible;
 
 /// Seconds of training between two progress lines, unless every step is wanted.
@@ -14,7 +14,7 @@ pub const INTERVAL_S: f64 = 10.0;
 pub struct PlainLines<W> {
     out: W,
     since_line_s: f64,
-    /// Steps and seconds since the stage started or resumed.
+    /// Steps since the stage started or resumed, and the seconds of all but the first, which may compile kernels.
     pace: (u64, f64),
     printed_tenth: u64,
     /// Seconds of training between two lines.
@@ -27,18 +27,26 @@ impl<W: Write> PlainLines<W> {
     }
 
     fn step_line(&mut self, event: &StepEvent) -> Option<String> {
-        self.pace = (self.pace.0 + 1, self.pace.1 + event.step_s);
+        self.pace.0 += 1;
+        if self.pace.0 > 1 {
+            self.pace.1 += event.step_s;
+        }
         self.since_line_s += event.step_s;
         let is_due = self.pace.0 == 1 || event.step == event.last_step || self.since_line_s >= self.interval_s;
         if !is_due {
             return None;
         }
         self.since_line_s = 0.0;
-        let mean_step_s = self.pace.1 / self.pace.0 as f64;
-        let StepEvent { step, last_step, last_step_of_size, .. } = *event;
-        let left = time_left(mean_step_s * last_step_of_size.saturating_sub(step) as f64, last_step_of_size, last_step);
+        let StepEvent { step, last_step, last_step_of_size, step_s, images_per_s, .. } = *event;
+        let mean_step_s = if self.pace.0 > 1 { self.pace.1 / (self.pace.0 - 1) as f64 } else { step_s };
+        // Of the same steps as the time left.
+        let rate = image_rate(images_per_s * step_s / mean_step_s.max(1e-9));
+        let seconds = mean_step_s * last_step_of_size.saturating_sub(step) as f64;
+        let left = time_left(seconds, last_step_of_size, last_step);
+        let left = if self.pace.0 > 1 { format!("  {left}") } else { String::new() };
+        // At most 80 columns, up to steps of five digits.
         let (name, width) = (event.stage.name(), last_step.to_string().len());
-        Some(format!("{name} {step:>width$}/{last_step}  {}  {mean_step_s:.3} s/step, {left}", step_metrics(event)))
+        Some(format!("{name} {step:>width$}/{last_step}  {}  {rate}{left}", step_metrics(event)))
     }
 }
 
@@ -90,13 +98,22 @@ mod tests {
         // The steps to come have larger images and another pace.
         let expected = "stage1: 100 steps
 stage1: images of 32 x 16 pixels to step 60
-stage1   1/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 15 s to step 60
-stage1  41/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s to step 60
-stage1  81/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s left
-stage1 100/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 0 s left
+stage1   1/100  loss 0.0123  21.50 dB  48 img/s
+stage1  41/100  loss 0.0123  21.50 dB  48 img/s  5 s to 60
+stage1  81/100  loss 0.0123  21.50 dB  48 img/s  5 s left
+stage1 100/100  loss 0.0123  21.50 dB  48 img/s  0 s left
 stage1: done in 25 s
 ";
         assert_eq!(printed(&events), expected);
+    }
+
+    #[test]
+    fn lines_fit_a_terminal() {
+        let Event::Step(first) = step(12_345, 12.34) else { unreachable!() };
+        let first = StepEvent { last_step: 90_000, last_step_of_size: 45_000, images_per_s: 0.85, ..first };
+        let text = printed(&[Event::Step(first), Event::Step(StepEvent { step: 12_346, ..first })]);
+        assert!(text.ends_with("stage1 12346/90000  loss 0.0123  21.50 dB  0.85 img/s  4 d 15 h to 45000\n"), "{text}");
+        assert!(text.lines().all(|line| line.len() <= 80), "{text}");
     }
 
     #[test]

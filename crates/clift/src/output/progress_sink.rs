@@ -8,7 +8,7 @@ use crate::output::bar::Bar;
 use crate::output::counter::ScanCounter;
 use crate::output::plain::{INTERVAL_S, PlainLines};
 use crate::output::stdout::print_warning;
-use crate::output::verbosity::Verbosity;
+use crate::verbosity::Verbosity;
 
 /// Creates a progress bar if the standard error is a terminal, progress lines otherwise; warnings alone for `--quiet`, and
 /// a line for every step for `--verbose`.

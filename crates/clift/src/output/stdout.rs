@@ -7,8 +7,8 @@ use std::path::Path;
 use anyhow::Context;
 use clift_eval::Summary;
 
-use crate::output::verbosity::Verbosity;
 use crate::output::visible::visible;
+use crate::verbosity::Verbosity;
 
 /// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is not an error.
 pub fn print_result(text: &str) -> anyhow::Result<()> {

@@ -1,6 +1,7 @@
 //! Arguments that several commands share: `parse` (values), `shared_args` (options), `splits` (data sets), `model_args` (a
-//! model with its data).
+//! model with its data), `adapter` (name of the GPU).
 
+pub(crate) mod adapter;
 pub(crate) mod model_args;
 pub(crate) mod parse;
 pub(crate) mod shared_args;

@@ -5,17 +5,14 @@ use std::path::{Path, PathBuf};
 use clift_data::{
     DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset, open_source,
 };
-use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
+use clift_model::{ModelConfig, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
 use clift_scene::ContextChoice;
-use clift_train::{Config, Override};
+use clift_train::{Config, NewestCheckpoint, Override, TrainError};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::output::counter::ScanCounter;
 use crate::output::stdout::{print_note, print_warning};
-
-/// The model that is used where none is named, trained on synthetic scenes.
-const SHIPPED_MODEL: &str = "models/rooms";
 
 /// Environment variable with the path of another model to use where none is named.
 const MODEL_VARIABLE: &str = "CLIFT_MODEL";
@@ -34,25 +31,39 @@ pub struct ModelArgs {
     trained_size: [usize; 2],
     /// Data set or capture beside the model.
     pub folder: Option<PathBuf>,
+    /// The weights of a run in training, in place of those of `path`.
+    checkpoint: Option<NewestCheckpoint>,
 }
 
 impl ModelArgs {
     /// Takes `RUN`, `RUN DIR`, or `DIR` alone with the shipped model.
     pub fn find(first: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
         if folder.is_none() && is_data(first) {
-            let shipped = shipped_model()?;
+            let shipped = default_model();
             print_note(&format!("model: {}", shipped.display()));
             return Self::new(&shipped, Some(first), args);
         }
         Self::new(first, folder, args)
     }
 
+    /// Takes what [`find`](Self::find) takes; of a run in training, the weights of its newest checkpoint.
+    pub fn find_newest(first: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
+        let Some(checkpoint) = NewestCheckpoint::find(first)? else { return Self::find(first, folder, args) };
+        let NewestCheckpoint { stage, step, path } = &checkpoint;
+        print_note(&format!("{} in training, step {step}: {}", stage.name(), path.display()));
+        let path = ModelPath { dir: first.into(), weights: path.join("model.bpk") };
+        Ok(Self { checkpoint: Some(checkpoint), ..Self::read(first, path, folder, args)? })
+    }
+
     /// Reads the config of a model. The config of an imported model has no data.
     pub fn new(model: &Path, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
-        if !model.exists() {
+        if !model.exists() && !is_shipped(model) {
             usage_bail!("{}: no such file or folder", model.display());
         }
-        let path = ModelPath::find(model)?;
+        Self::read(model, ModelPath::find(model)?, folder, args)
+    }
+
+    fn read(model: &Path, path: ModelPath, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
         let read = |set: &[String]| read_config(&path.dir.join("config.toml"), set, |_| Ok(()));
         let (mut config, overrides) = read(&args.set)?;
         check_network(&config.model, &path)?;
@@ -64,7 +75,7 @@ impl ModelArgs {
             config.data.root.clone_from(&folder);
         }
         config.validate()?;
-        Ok(Self { given: model.into(), path, config, overrides, trained_size, folder })
+        Ok(Self { given: model.into(), path, config, overrides, trained_size, folder, checkpoint: None })
     }
 
     /// Opens one split of the folder, or of the data of the config.
@@ -130,8 +141,12 @@ impl ModelArgs {
     }
 
     /// Reads the weights.
-    pub fn open(&self) -> Result<TrainedModel, ModelError> {
-        TrainedModel::open_with(&self.path, &self.config.model, &self.config.device.open()?)
+    pub fn open(&self) -> Result<TrainedModel, TrainError> {
+        let device = self.config.device.open()?;
+        match &self.checkpoint {
+            Some(checkpoint) => checkpoint.open(&self.config, &self.path.dir, &device),
+            None => Ok(TrainedModel::open_with(&self.path, &self.config.model, &device)?),
+        }
     }
 }
 
@@ -155,22 +170,9 @@ pub fn is_data(path: &Path) -> bool {
     is_json || path.is_dir() && !path.join("config.toml").exists() && ModelPath::find(path).is_err()
 }
 
-/// Returns the model that ships with clift: that of `CLIFT_MODEL`, or `models/rooms` in the current folder or above the
-/// program.
-pub fn shipped_model() -> anyhow::Result<PathBuf> {
-    if let Some(model) = std::env::var_os(MODEL_VARIABLE) {
-        return Ok(model.into());
-    }
-    let program = std::env::current_exe().unwrap_or_default();
-    let places = std::iter::once(Path::new("")).chain(program.ancestors().skip(1));
-    let mut places = places.map(|place| place.join(SHIPPED_MODEL));
-    let Some(model) = places.find(|place| place.is_dir()) else {
-        usage_bail!(
-            "no run or model is named, and {SHIPPED_MODEL}, which ships with clift, is not found; run from the repository, \
-             or set {MODEL_VARIABLE} to its path"
-        )
-    };
-    Ok(model)
+/// Returns the model that is used where none is named: that of `CLIFT_MODEL`, or the one that ships with clift.
+pub fn default_model() -> PathBuf {
+    std::env::var_os(MODEL_VARIABLE).map_or_else(|| SHIPPED_MODEL.into(), PathBuf::from)
 }
 
 #[cfg(test)]

@@ -57,6 +57,22 @@ pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
     parse_number(text, |count| *count > 0, "write a number of at least 1")
 }
 
+/// Parses the path of a file or folder to read.
+pub(crate) fn parse_input(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    if path.exists() { Ok(path) } else { Err("no such file or folder".into()) }
+}
+
+/// Parses the directory of a run.
+pub(crate) fn parse_run(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match (path.exists(), path.join("config.toml").is_file()) {
+        (true, true) => Ok(path),
+        (true, false) => Err("that is no run: it has no config.toml; write the `run_dir` of a `clift train`".into()),
+        (false, _) => Err("no such folder; write the `run_dir` of a `clift train`".into()),
+    }
+}
+
 /// Parses the path of a file to write, before the work whose results it takes.
 pub(crate) fn parse_output(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
@@ -151,6 +167,8 @@ mod tests {
         let refused =
             |(file, video): (Result<PathBuf, String>, _), word: &str| file == video && file.unwrap_err().contains(word);
         assert!(refused(folder, "is a folder") && refused(no_folder, "no folder no/such"));
+        assert!(parse_input(".").is_ok() && parse_input("no/such").is_err());
+        assert!([".", "no/such"].iter().all(|path| parse_run(path).unwrap_err().contains("write the `run_dir`")));
         assert!(parse_budget_ms("0").is_err() && parse_budget_ms("nan").is_err());
     }
 }

@@ -4,17 +4,34 @@ use std::path::{Path, PathBuf};
 
 use clift_data::ImageEncoding;
 use clift_model::DeviceName;
-use clift_train::{Config, Override, TrainError, read_checked_config};
+use clift_train::{Config, Override, TrainError, parse_config, read_checked_config};
 use serde::Serialize;
 
 use crate::commands::args::parse::parse_output;
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
+/// Configs inside the program, by the paths that they have in the repository.
+const CONFIGS: [(&str, &str); 10] = [
+    ("configs/capture.toml", include_str!("../../../../../configs/capture.toml")),
+    ("configs/dl3dv.toml", include_str!("../../../../../configs/dl3dv.toml")),
+    ("configs/lvsm-ed-re10k.toml", include_str!("../../../../../configs/lvsm-ed-re10k.toml")),
+    ("configs/lvsm-ed-synthetic.toml", include_str!("../../../../../configs/lvsm-ed-synthetic.toml")),
+    ("configs/lvsm-ed-tiny.toml", include_str!("../../../../../configs/lvsm-ed-tiny.toml")),
+    ("configs/re10k-small.toml", include_str!("../../../../../configs/re10k-small.toml")),
+    ("configs/re10k.toml", include_str!("../../../../../configs/re10k.toml")),
+    ("configs/rooms.toml", include_str!("../../../../../configs/rooms.toml")),
+    ("configs/synthetic.toml", include_str!("../../../../../configs/synthetic.toml")),
+    ("configs/tiny.toml", include_str!("../../../../../configs/tiny.toml")),
+];
+
 /// Options that override keys of a config.
 #[derive(Debug, clap::Args)]
 pub struct ConfigArgs {
     /// Override a key of the config, e.g. `stage1.steps=100`; repeatable
+    ///
+    /// The value is TOML; a word or a path of letters, digits and -_./\:~+@% needs no quotes. Others are quoted twice:
+    /// `--set 'data.root="my photos"'`, in the prompt of Windows `--set "data.root='C:\my photos'"`.
     #[arg(long, value_name = "KEY=TOML")]
     pub set: Vec<String>,
     /// Select the device: flex, ndarray or wgpu [default: `device` of the config]
@@ -31,13 +48,21 @@ impl ConfigArgs {
     }
 }
 
-/// Reads a config, applies the overrides of `--set`, checks the values and prints what changed.
+/// Reads a config, applies the overrides of `--set`, checks the values and prints what changed. Where a path of [`CONFIGS`] does
+/// not exist, the config inside the program is read.
 pub fn read_config(
     path: &Path,
     set: &[String],
     check: impl FnOnce(&Config) -> Result<(), TrainError>,
 ) -> anyhow::Result<(Config, Vec<Override>)> {
-    let (config, overrides) = read_checked_config(path, set, check)?;
+    let shipped = || CONFIGS.iter().find(|(name, _)| path == Path::new(name) && !path.exists());
+    let (config, overrides) = match shipped() {
+        Some((_, text)) => {
+            print_note(&format!("config: {}, which ships with clift", path.display()));
+            parse_config(path, text, set, check)?
+        }
+        None => read_checked_config(path, set, check)?,
+    };
     for change in &overrides {
         print_note(&change.to_string());
     }
@@ -94,5 +119,21 @@ impl ChunkArgs {
 
     pub fn encoding(&self) -> ImageEncoding {
         self.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_program_contains_every_config() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+        let mut names: Vec<String> = std::fs::read_dir(folder)
+            .unwrap()
+            .map(|item| format!("configs/{}", item.unwrap().file_name().to_string_lossy()))
+            .collect();
+        names.sort();
+        assert!(CONFIGS.iter().map(|(name, _)| name).eq(&names), "{names:?} are in the repository");
     }
 }

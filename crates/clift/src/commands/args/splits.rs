@@ -7,6 +7,7 @@ use clift_data::{DatasetRoot, FileOptions, OpenedSource, SourceOptions, Split, T
 use clift_train::{Override, parse_config};
 use serde::{Deserialize, Serialize};
 
+use crate::commands::args::parse::parse_input;
 use crate::output::stdout::print_note;
 
 /// The config keys that `--set` accepts for a data set: `data.files.*`.
@@ -26,6 +27,7 @@ struct DataKeys {
 #[derive(Debug, clap::Args)]
 pub struct SourceArgs {
     /// Data set in any layout, or one scene
+    #[arg(value_parser = parse_input)]
     pub dir: PathBuf,
     /// Set a path of the layout, e.g. `data.files.image_folder=images_4`; repeatable
     #[arg(long, value_name = "data.files.KEY=TOML")]
@@ -35,7 +37,7 @@ pub struct SourceArgs {
 impl SourceArgs {
     /// Returns the options of `--set` and what they changed.
     pub fn files(&self) -> anyhow::Result<(FileOptions, Vec<Override>)> {
-        let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set)?;
+        let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set, |_| Ok(()))?;
         Ok((keys.data.files, changes))
     }
 

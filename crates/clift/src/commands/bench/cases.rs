@@ -11,7 +11,7 @@ use crate::commands::bench::allreduce::BenchAllReduceArgs;
 use crate::commands::bench::data::BenchDataArgs;
 use crate::commands::bench::precision::BenchPrecisionArgs;
 use crate::commands::bench::timing_args::TimingArgs;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::counter::Counter;
 use crate::output::stdout::print_result;
 use crate::output::units::{memory_size, seconds};
@@ -23,7 +23,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let config = timing.config.read(path, |_| Ok(()))?;
     let options = timing.options(BenchCase::ALL);
     let options = BenchOptions { error: !args.no_error, features: args.features.clone(), ..options };
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let mut counter: Option<Counter> = None;
     let report = run_bench(&config, &options, &stop, &mut |event| match event {
         BenchEvent::Progress { done, total } => {

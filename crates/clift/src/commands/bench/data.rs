@@ -8,7 +8,7 @@ use clift_data::{ClipOptions, FileOptions};
 use clift_eval::{peak_bytes, start_peak, table};
 use serde::Serialize;
 
-use crate::commands::args::parse::{parse_size, parse_views};
+use crate::commands::args::parse::{parse_input, parse_size, parse_views};
 use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{Splits, open_splits};
 use crate::exit_code::usage_bail;
@@ -18,6 +18,7 @@ use crate::output::units::{memory_size, seconds};
 #[derive(Debug, clap::Args)]
 pub struct BenchDataArgs {
     /// Data set in any layout
+    #[arg(value_parser = parse_input)]
     pub dir: PathBuf,
     /// Read this split
     #[arg(long, value_enum, default_value_t = Splits::Train)]

@@ -7,7 +7,7 @@ use clift_bench::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precis
 use clift_eval::table;
 
 use crate::commands::bench::timing_args::TimingArgs;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::stdout::print_result;
 use crate::output::units::seconds;
 
@@ -23,7 +23,8 @@ pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let json = timing.json.open(&[&args.config])?;
     let config = timing.config.read(&args.config, |_| Ok(()))?;
-    let report = compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag()?)?;
+    let report =
+        compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag(Ending::WITHOUT_RESULTS)?)?;
     print_result(&report_text(&report))?;
     json.write(&report)
 }

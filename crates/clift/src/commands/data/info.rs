@@ -23,9 +23,6 @@ use crate::output::stdout::print_result;
 const MAX_SYNTHETIC: usize = 1000;
 
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
-    if !args.path.exists() {
-        usage_bail!("{}: no such file or folder", args.path.display());
-    }
     let json = args.json.open(&[&args.path])?;
     let is_json = args.path.extension().is_some_and(|extension| extension == "json");
     // A scene may be given by one of its camera files, e.g. transforms_train.json.

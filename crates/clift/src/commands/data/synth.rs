@@ -101,7 +101,7 @@ fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {
     overrides.extend(options);
     overrides.extend(args.seed.map(|seed| format!("seed={seed}")));
     overrides.extend(args.set.iter().cloned());
-    let (config, changed) = parse_config::<SyntheticConfig>(Path::new("--set"), "", &overrides)?;
+    let (config, changed) = parse_config::<SyntheticConfig>(Path::new("--set"), "", &overrides, |_| Ok(()))?;
     if changed.iter().any(|change| change.key == "split") {
         usage_bail!("--set split is not supported; use --split");
     }
@@ -290,7 +290,7 @@ mod tests {
         let config = SyntheticConfig { num_frames, width: size[0], height: size[1], ..Default::default() };
         let lines = snippet(&config, Path::new("/data/a \"room\""), has_index).unwrap();
         let file = format!("run_dir = \"run\"\n{lines}\n[stage1]\n[stage2]\n");
-        let (config, _) = parse_config::<Config>(Path::new("a.toml"), &file, &[]).unwrap();
+        let (config, _) = parse_config::<Config>(Path::new("a.toml"), &file, &[], |_| Ok(())).unwrap();
         config.validate().unwrap_or_else(|error| panic!("{num_frames} frames: {error}\n{lines}"));
         config
     }

@@ -1,14 +1,22 @@
 //! `clift doctor --stability`.
 
-use clift_bench::{CaseSize, StabilityRow, outcome_text, run_stability, stability_markdown};
+use clift_bench::{CaseSize, StabilityRow, catch_panic, outcome_text, run_stability, stability_markdown};
 use clift_model::DeviceName;
 
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
-/// Runs every case on every device of the build; fails if an error exceeds its bound.
+/// Runs every case on every device of the build that this machine has; fails if an error exceeds its bound.
 pub fn run(markdown: Option<&OutputFile>) -> anyhow::Result<()> {
-    let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
+    let opens = |device: &DeviceName| {
+        let opened = catch_panic(|| device.open()).map(|opened| opened.map(drop).map_err(|error| error.to_string()));
+        let reason = opened.and_then(|opened| opened).err();
+        if let Some(reason) = &reason {
+            print_note(&format!("{device} is not measured: {reason}"));
+        }
+        reason.is_none()
+    };
+    let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|name| name.is_built()).filter(opens).collect();
     let rows = run_stability(&devices, CaseSize::Full, &mut |row| print_note(&line(&devices, row)))?;
     if let Some(file) = markdown {
         let text = format!("{}\n{}\n", MARKDOWN_HEAD, stability_markdown(&devices, &rows));

@@ -27,6 +27,8 @@ pub struct Rendered {
     pub timing: Timing,
     /// Indices of the tokens of each frame, ascending; `None` if every frame uses all tokens.
     pub tokens: Option<Vec<Vec<u32>>>,
+    /// Whether the video was written.
+    pub has_video: bool,
 }
 
 /// Settings of all frames.
@@ -39,11 +41,17 @@ pub struct Frames<'a> {
     pub video: Option<&'a Path>,
 }
 
+/// File of the animation.
+pub const ANIMATION: &str = "animation.png";
+
 /// File of the path, token counts and times of the frames.
 pub const REPORT: &str = "render.json";
 
 /// Checks that the output folder is empty or absent, or holds frames that `replace` allows to replace.
 pub fn check_out(out: &Path, replace: bool) -> anyhow::Result<()> {
+    if out.is_file() {
+        usage_bail!("output folder {}: that is a file; write the name of a folder", out.display());
+    }
     if is_empty_folder(out).with_context(|| format!("reading {}", out.display()))? {
         return Ok(());
     }
@@ -79,13 +87,13 @@ pub fn write_frames(
     stop: &AtomicBool,
 ) -> anyhow::Result<Rendered> {
     let &Frames { height, width, num_render_tokens, fps, video } = frames;
-    let mut animation = Animation::new(&folder.join("animation.png"), width, height, views.len(), fps)?;
+    let mut animation = Animation::new(&folder.join(ANIMATION), width, height, views.len(), fps)?;
     let mut writer = match video {
         Some(path) => Video::start(path, width, height, fps)?,
         None => None,
     };
     if video.is_some() && writer.is_none() {
-        print_warning("no `ffmpeg` on the PATH: no video is written, the animation is animation.png");
+        print_warning(format!("no `ffmpeg` on the PATH: no video is written, the animation is {ANIMATION}"));
     }
     let mut counter = Counter::new("frames", views.len() as u64);
     let (mut select_s, mut render_s, mut tokens) = (Vec::new(), Vec::new(), Vec::new());
@@ -110,9 +118,10 @@ pub fn write_frames(
         counter.set(render_s.len() as u64);
     }
     animation.finish()?;
+    let has_video = writer.is_some();
     if let Some(video) = writer {
         video.finish()?;
     }
     let timing = Timing { select_s: median(&select_s), render_s: median(&render_s) };
-    Ok(Rendered { timing, tokens: tokens.into_iter().collect() })
+    Ok(Rendered { timing, tokens: tokens.into_iter().collect(), has_video })
 }

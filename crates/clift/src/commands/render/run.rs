@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clift_core::{Camera, StagedDir, interpolate_path, mean_intrinsics, orbit_path};
-use clift_data::read_poses;
+use clift_data::{plural, read_poses};
 use clift_eval::available_bytes;
 use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, TokenCount};
 use clift_scene::{MAX_SIDE_PX, RenderBudget, Scene, SceneRenderer, check_frames, frame_bytes, load_renderer};
@@ -13,7 +13,7 @@ use serde::Serialize;
 use crate::commands::render::args::{CameraPath, RenderArgs};
 use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result, print_warning};
 use crate::output::units::file_size;
@@ -66,7 +66,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let views = path_cameras(&scene, args, height, width)?;
     check_frames(&scene, &views, [height, width])?;
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let opened = device.open()?;
     let precision = args.precision.unwrap_or_else(|| Precision::for_images(&opened));
     precision.check("--precision", &opened)?;
@@ -78,7 +78,8 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let creating = || format!("creating {}", args.out.display());
     let files = StagedDir::new(&args.out).with_context(creating)?;
     let frames = Frames { height, width, num_render_tokens, fps: args.fps, video: args.video.as_deref() };
-    let Rendered { timing, tokens } = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
+    let Rendered { timing, tokens, has_video } =
+        frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
     let Timing { select_s, render_s } = timing;
     let report = Report {
         scene: scene.key.clone(),
@@ -99,22 +100,26 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     OutputFile::new(&files.path().join(frames::REPORT), false, &[])?.write_json(&report)?;
     files.commit().with_context(creating)?;
     frames::remove_later_frames(&args.out, views.len()).with_context(creating)?;
+    let video = args.video.as_ref().filter(|_| has_video);
     print_result(&format!(
-        "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
-         {:.1} ms per frame on {device} in {precision} (median): {:.1} ms token selection, {:.1} ms rendering",
+        "{}: {} of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
+         {:.1} ms per frame on {device} in {precision} (median): {:.1} ms token selection, {:.1} ms rendering\n\
+         animation, for a browser: {}{}",
         args.out.display(),
-        views.len(),
+        plural(views.len(), "frame"),
         scene.num_tokens(),
         1e3 * (select_s + render_s),
         1e3 * select_s,
         1e3 * render_s,
+        args.out.join(frames::ANIMATION).display(),
+        video.map_or_else(String::new, |video| format!("\nvideo: {}", video.display())),
     ))
 }
 
 /// Returns the weight file of the scene that was read from `file`: that of `model`, or of the scene's own model.
 pub fn scene_weights(scene: &Scene, file: &Path, model: Option<&Path>) -> anyhow::Result<PathBuf> {
     let path = model.map_or_else(|| scene.find_model(file), Path::to_path_buf);
-    let weights = ModelPath::for_tokens(&path, scene.kind);
+    let weights = ModelPath::for_tokens(&path, scene.kind)?;
     if model.is_none() && !weights.exists() {
         // The path comes from an untrusted file: control characters must not reach the terminal.
         let path = weights.display().to_string();
