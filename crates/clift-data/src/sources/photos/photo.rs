@@ -7,7 +7,7 @@ use image::metadata::Orientation;
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::geometry::lens::Lens;
+use crate::geometry::lens::{Lens, Projection};
 use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
 use crate::image::undistort::Undistortion;
 
@@ -84,6 +84,11 @@ impl Photo {
         (lens, undistort): (Lens, bool),
     ) -> Result<Self, DataError> {
         intrinsics_norm.validate()?;
+        if !undistort && lens.projection != Projection::Perspective {
+            let what =
+                "the images of a fisheye lens are not those of a pinhole camera; set data.files.undistort to true";
+            return Err(DataError::bad_camera(what.into()));
+        }
         let (time, shape) = (number_at_end(&path), size.map(|[width, height]| width / height));
         if !undistort || lens.is_pinhole() {
             return Ok(Self {

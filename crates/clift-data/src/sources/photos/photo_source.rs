@@ -22,10 +22,11 @@ const MAX_CACHED_SCENES: usize = 256;
 const MAX_NAMED_FRAMES: usize = 10_000;
 
 /// Images that a note counts.
-const COUNTED: [&str; 3] = [
+const COUNTED: [&str; 4] = [
     "without a camera, not used",
     "turned by the EXIF orientation, as the size of the cameras requires",
     "with an EXIF orientation that is not applied, as the cameras have the stored size",
+    "cut to the part of the lens that a pinhole camera can show, at most 120 degrees",
 ];
 
 #[derive(Clone, Debug, Default)]
@@ -225,7 +226,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
     };
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
-    let counts = [num_without_camera, num_turned, num_unturned];
+    let num_cut = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
+    let counts = [num_without_camera, num_turned, num_unturned, num_cut];
     Ok(Findings { num_frames, unusable, missing, counts, notes, reason })
 }
 
