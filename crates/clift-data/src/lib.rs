@@ -71,7 +71,7 @@ pub use geometry::path_spread::contexts_along_path;
 pub use geometry::pose_file::read_poses;
 
 // Images.
-pub use image::codec::{decode_image, encode_jpeg, encode_png};
+pub use image::codec::{decode_image, encode_jpeg, encode_png, image_size};
 pub use image::fit::{Crop, fit_image};
 pub use image::undistort::Undistortion;
 

@@ -148,6 +148,7 @@ impl SplitFolder<'_> {
                 image_folder: files.image_folder.clone(),
                 first_folders: if is_dl3dv { DL3DV_FOLDERS } else { &[] },
                 undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
+                background: options.background,
             },
             filters: options.filters.clone(),
             whole_scenes: (is_dl3dv || kind == SourceKind::Re10kTxt) && !files.keep_incomplete,

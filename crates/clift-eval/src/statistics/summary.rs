@@ -116,6 +116,8 @@ pub struct Summary {
     pub split: Option<EvalSplit>,
     /// Target views that are also contexts: the input holds their images.
     pub num_context_targets: usize,
+    /// Share of the target pixels that masks leave out of the metrics; `null` without masks.
+    pub masked_share: Option<f64>,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
     /// SHA-256 of the LPIPS weights.
@@ -153,12 +155,14 @@ impl Summary {
             .map(|(key, views)| SummaryPoint::new(results, key, views))
             .collect();
         mark_fronts(&mut points);
+        let masked: f64 = results.masked.values().flat_map(BTreeMap::values).sum();
         Self {
             num_scenes: scenes.len(),
             num_views: views.len(),
             num_skipped: results.skipped.len(),
             split: results.split,
             num_context_targets: results.context_targets.len(),
+            masked_share: (!results.masked.is_empty()).then(|| masked / views.len().max(1) as f64),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
@@ -322,6 +326,7 @@ mod tests {
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
+        views.masked.insert("a".into(), [(0, 0.25)].into());
         let cost =
             Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
         views.costs.insert(CLIFT, cost);
@@ -333,6 +338,7 @@ mod tests {
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
+            "masked_share": 0.25,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],

@@ -33,6 +33,9 @@ impl fmt::Display for Summary {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
         let split = self.split.map_or_else(String::new, |split| format!(" ({split})"));
         writeln!(f, "{num_views} views of {num_scenes} scenes{split}, {num_skipped} scenes skipped")?;
+        if let Some(share) = self.masked_share {
+            writeln!(f, "{:.1} % of the target pixels are masked and do not count", 100.0 * share)?;
+        }
         for warning in self.warnings() {
             writeln!(f, "warning: {warning}")?;
         }

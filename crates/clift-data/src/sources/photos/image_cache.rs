@@ -210,7 +210,7 @@ mod tests {
         let mut is_decoded = false;
         let image = cache.scaled(photo, || {
             is_decoded = true;
-            photo.decode("k", 0)
+            photo.decode([0; 3], "k", 0).map(|(image, _)| image)
         });
         (image.unwrap(), is_decoded)
     }
@@ -223,7 +223,7 @@ mod tests {
         for (name, lens) in [("a.png", Lens::default()), ("b.png", distorted)] {
             let photo = photo(root.path(), name, &ramp(647, 801), lens);
             let fitted = |image: &RgbImage| fit_image(image, photo.camera.intrinsics, 32, 32, false).unwrap();
-            let expected = fitted(&photo.decode("k", 0).unwrap());
+            let expected = fitted(&photo.decode([0; 3], "k", 0).unwrap().0);
             for is_decoded in [true, false] {
                 let (image, was_decoded) = read_through(&cache, &photo);
                 assert_eq!((fitted(&image), was_decoded), (expected.clone(), is_decoded));

@@ -78,7 +78,7 @@ macro_rules! with_optics {
 }
 
 with_optics!(Document { frames: Bounded<Entry, MAX_FRAMES>, });
-with_optics!(Entry { file_path: String, transform_matrix: Bounded<[f64; 4], 4>, });
+with_optics!(Entry { file_path: String, mask_path: Option<String>, transform_matrix: Bounded<[f64; 4], 4>, });
 
 impl Entry {
     /// Returns the upper three rows of the matrix; the fourth is optional.
@@ -236,6 +236,11 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
                 continue;
             }
         };
+        let mask = entry.mask_path.as_ref().map(|mask| folder.join(mask.replace('\\', "/")));
+        if mask.as_ref().is_some_and(|mask| !mask.is_file()) {
+            scene.skip(name, "without the mask of its mask_path");
+            continue;
+        }
         let optics = entry.optics().or(&top);
         let lens = optics.lens().map_err(in_frame)?;
         let given = optics.size().map_err(in_frame)?;
@@ -250,7 +255,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
             .map_err(DataError::from)
             .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)))
             .map_err(PhotoScene::in_frame(path, name))?;
-        scene.photos.push(photo);
+        scene.photos.push(Photo { mask, ..photo });
     }
     scene.num_without_camera = images.num_unrequested();
     Ok(scene)

@@ -7,6 +7,7 @@ use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
 use rayon::prelude::*;
 
 use crate::error::DataError;
+use crate::image::codec::has_alpha;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
@@ -22,11 +23,13 @@ const MAX_CACHED_SCENES: usize = 256;
 const MAX_NAMED_FRAMES: usize = 10_000;
 
 /// Images that a note counts.
-const COUNTED: [&str; 4] = [
+const COUNTED: [&str; 6] = [
     "without a camera, not used",
     "turned by the EXIF orientation, as the size of the cameras requires",
     "with an EXIF orientation that is not applied, as the cameras have the stored size",
     "cut to the part of the lens that a pinhole camera can show, at most 120 degrees",
+    "with a mask, whose black pixels get the colour data.background and do not count in loss and metrics",
+    "with an alpha channel, whose transparent pixels get the colour data.background and do not count",
 ];
 
 #[derive(Clone, Debug, Default)]
@@ -170,7 +173,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
     let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = folder.read(&options.photos)?;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
-    let (mut num_turned, mut num_unturned) = (0, 0);
+    let (mut num_turned, mut num_unturned, mut num_with_alpha) = (0, 0, 0);
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
     for (position, photo) in photos.iter().enumerate().take(num_checked) {
         match photo.header() {
@@ -178,6 +181,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
                 is_small |= width < options.min_size[0] || height < options.min_size[1];
                 num_turned += usize::from(is_turned);
                 num_unturned += usize::from(has_unused_orientation);
+                num_with_alpha += usize::from(has_alpha(&photo.path));
             }
             Err(error) => {
                 let name = photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -227,7 +231,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
     let num_cut = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
-    let counts = [num_without_camera, num_turned, num_unturned, num_cut];
+    let num_masked = photos.iter().filter(|photo| photo.mask.is_some()).count();
+    let counts = [num_without_camera, num_turned, num_unturned, num_cut, num_masked, num_with_alpha];
     Ok(Findings { num_frames, unusable, missing, counts, notes, reason })
 }
 
@@ -262,14 +267,21 @@ impl SceneSource for PhotoSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
+        Ok(self.frame_with_coverage(scene, frame)?.0)
+    }
+
+    fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
         let photo = self.photo(scene, frame)?;
-        let decode = || photo.decode(self.key(scene), frame);
-        self.image_cache.as_ref().map_or_else(decode, |cache| cache.scaled(&photo, decode))
+        let decode = || photo.decode(self.options.background, self.key(scene), frame);
+        match &self.image_cache {
+            Some(cache) if !photo.has_coverage() => Ok((cache.scaled(&photo, || Ok(decode()?.0))?, None)),
+            _ => decode(),
+        }
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
-        if photo.undistortion.is_some() || photo.header()?.is_turned {
+        if photo.undistortion.is_some() || photo.has_coverage() || photo.header()?.is_turned {
             return Ok(None);
         }
         photo.read().map(Some)

@@ -50,7 +50,7 @@ fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Strin
         match images.get(&time) {
             Some(path) => {
                 let (path, time) = (path.clone(), Some(time));
-                scene.photos.push(Photo { path, camera, undistortion: None, shape: None, time });
+                scene.photos.push(Photo { path, camera, undistortion: None, shape: None, mask: None, time });
             }
             None => scene.skip(time.to_string(), NO_IMAGE),
         }
