@@ -35,7 +35,7 @@ pub struct DataConfig {
     pub pose_scale: PoseScale,
     /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
     pub crop: Crop,
-    /// Colour of masked and transparent pixels, RGB of 0 to 255. They do not count in loss and metrics.
+    /// Colour of masked and transparent pixels, RGB of 0 to 255.
     pub background: [u8; 3],
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     pub flip: bool,

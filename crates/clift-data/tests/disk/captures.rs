@@ -120,7 +120,7 @@ fn fisheye_images_are_cut_with_a_note_and_never_taken_for_pinhole_images() {
     let k = source.cameras(0).unwrap()[0].intrinsics;
     assert!((((1.0 - k.cx) / k.fx).atan().to_degrees() - 60.0).abs() < 1e-9, "{k:?}");
     let options = FileOptions { undistort: Some(false), ..FileOptions::default() };
-    let message = open_with(root.path(), options).map(|_| ()).unwrap_err().to_string();
+    let message = open_with(root.path(), options).map(|_| ()).unwrap_err();
     assert!(message.contains("set data.files.undistort to true"), "{message}");
 }
 
