@@ -149,6 +149,20 @@ impl Lens {
         self.distort_projected(ray * self.projection.factor(ray.length_squared()).0).into()
     }
 
+    /// Computes [`Lens::distort`] of a lens that [`Lens::is_opencv`].
+    #[inline]
+    pub(crate) fn distort_opencv(&self, ray: [f64; 2]) -> [f64; 2] {
+        let ([k1, k2, k3, ..], ray) = (self.radial, DVec2::from(ray));
+        let r2 = ray.length_squared();
+        (ray * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) + self.tangential(ray)).into()
+    }
+
+    /// Returns whether there are none but OpenCV's five coefficients.
+    pub(crate) fn is_opencv(&self) -> bool {
+        let [k1, k2, k3, ..] = self.radial;
+        *self == Self { radial: [k1, k2, k3, 0.0, 0.0, 0.0], tangential: self.tangential, ..Self::default() }
+    }
+
     /// Returns the radial factor at the square of a distance, and its derivative over that square.
     fn radial_factor(&self, r2: f64) -> (f64, f64) {
         let (above, slope_above) = polynomial(&self.radial, r2);
@@ -159,13 +173,14 @@ impl Lens {
 
     /// Returns the tangential and prism terms.
     fn shift(&self, at: DVec2) -> DVec2 {
-        let DVec2 { x, y } = at;
-        let ([p1, p2], [s1, s2, s3, s4]) = (self.tangential, self.prism);
+        let ([s1, s2, s3, s4], r2) = (self.prism, at.length_squared());
+        self.tangential(at) + DVec2::new(r2 * (s1 + r2 * s2), r2 * (s3 + r2 * s4))
+    }
+
+    fn tangential(&self, at: DVec2) -> DVec2 {
+        let (DVec2 { x, y }, [p1, p2]) = (at, self.tangential);
         let (r2, mixed) = (at.length_squared(), 2.0 * x * y);
-        DVec2::new(
-            p1 * mixed + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2),
-            p1 * (r2 + 2.0 * y * y) + p2 * mixed + r2 * (s3 + r2 * s4),
-        )
+        DVec2::new(p1 * mixed + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + p2 * mixed)
     }
 
     /// Returns the distorted ray of a projection.
@@ -293,12 +308,15 @@ mod tests {
     }
 
     #[test]
-    fn bad_coefficients_are_named() {
+    fn bad_coefficients_are_named_and_opencv_lenses_take_the_short_formula() {
         let message = |lens: Lens| lens.validate().unwrap_err().to_string();
         let bad_p2 = Lens { tangential: [0.0, f64::NAN], ..PHONE };
         assert_eq!(message(bad_p2), "bad camera: p2 is NaN, expected a finite number");
         let wide = Lens { projection: Projection::Fov(3.2), ..Lens::default() };
         assert_eq!(message(wide), "bad camera: omega is 3.2, expected an angle between 0 and pi");
+        assert!(PHONE.is_opencv() && !Lens { divisor: [0.1, 0.0, 0.0], ..PHONE }.is_opencv());
+        let ([x, y], [fast_x, fast_y]) = (PHONE.distort([0.3, -0.2]), PHONE.distort_opencv([0.3, -0.2]));
+        assert!((x - fast_x).abs() < 1e-15 && (y - fast_y).abs() < 1e-15);
         assert!(PHONE.validate().is_ok() && !PHONE.is_pinhole() && Lens::default().is_pinhole());
     }
 

@@ -128,14 +128,29 @@ impl Undistortion {
 
     /// Computes the position of each pixel of a row in the distorted image, clamped to the image: column and row from
     /// the centre of the first pixel, in units of 1 / [`STEPS`] pixel.
-    fn find_positions(&self, row: usize, [width, height]: [usize; 2], positions: &mut [[u32; 2]]) {
+    fn find_positions(&self, row: usize, size: [usize; 2], positions: &mut [[u32; 2]]) {
+        // The compiler vectorises the first loop, six times as fast as the second.
+        if self.lens.is_opencv() {
+            self.find_positions_by(|ray| self.lens.distort_opencv(ray), row, size, positions);
+        } else {
+            self.find_positions_by(|ray| self.lens.distort(ray), row, size, positions);
+        }
+    }
+
+    fn find_positions_by(
+        &self,
+        distort: impl Fn([f64; 2]) -> [f64; 2],
+        row: usize,
+        [width, height]: [usize; 2],
+        positions: &mut [[u32; 2]],
+    ) {
         let (from, to) = (self.from.to_pixels(width, height), self.to.to_pixels(width, height));
         let (step_x, y) = (1.0 / to.fx, (row as f64 + 0.5 - to.cy) / to.fy);
         let most = [width, height].map(|side| ((side - 1) * STEPS) as f64);
         let steps = STEPS as f64;
         for (column, position) in positions.iter_mut().enumerate() {
             let x = (f64::from(column as u32) + 0.5 - to.cx) * step_x;
-            let [x, y] = self.lens.distort([x, y]);
+            let [x, y] = distort([x, y]);
             let at = [(x * from.fx + from.cx - 0.5) * steps + 0.5, (y * from.fy + from.cy - 0.5) * steps + 0.5];
             *position = [at[0].clamp(0.0, most[0]) as u32, at[1].clamp(0.0, most[1]) as u32];
         }
