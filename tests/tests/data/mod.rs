@@ -3,4 +3,4 @@
 mod convert;
 mod data_tools;
 mod layouts;
-mod poses;
+pub(crate) mod poses;

@@ -26,12 +26,16 @@ if [ "$1" = mapper ]; then
 fi
 "#;
 
-/// A folder with the script.
-fn with_colmap() -> Place {
-    let place = Place::new();
+/// Writes the script into `bin`, which is the PATH of a command then.
+pub fn write_colmap(place: &Place) {
     let model = repository("data-fixtures/layouts/colmap_bin/attic/sparse/0");
     place.write("bin/colmap", FAKE_COLMAP.replace("MODEL", &model.display().to_string()).as_bytes());
     std::fs::set_permissions(place.at("bin/colmap"), std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+fn with_colmap() -> Place {
+    let place = Place::new();
+    write_colmap(&place);
     place
 }
 
