@@ -56,6 +56,7 @@ fn open_files(
         kind,
         filters,
         files,
+        background: config.background,
         min_size: [config.width, config.height],
         image_cache: Some(config.image_cache.clone()),
         reads_chunks: false,

@@ -66,13 +66,13 @@ pub use sampling::training_clips::{ReadClip, TrainingClips};
 pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Lenses, files of poses, and measures on poses.
-pub use geometry::lens::Lens;
+pub use geometry::lens::{Lens, Projection};
 pub use geometry::overlap::overlap;
 pub use geometry::path_spread::contexts_along_path;
 pub use geometry::pose_file::read_poses;
 
 // Images.
-pub use image::codec::{decode_image, encode_jpeg, encode_png};
+pub use image::codec::{decode_image, encode_jpeg, encode_png, image_size};
 pub use image::fit::{Crop, fit_image};
 pub use image::undistort::Undistortion;
 

@@ -101,7 +101,12 @@ impl Place {
                 frame_index: vec![0, 1],
             }
         };
-        Clip { key: format!("scene {scene}"), context: views([-0.8, 0.7]), target: views([-0.3, 0.4]) }
+        Clip {
+            key: format!("scene {scene}"),
+            context: views([-0.8, 0.7]),
+            target: views([-0.3, 0.4]),
+            target_weights: None,
+        }
     }
 
     pub fn clips(&self) -> Vec<Clip> {

@@ -93,6 +93,7 @@ impl ToF64 for DeviceBatch {
             context: self.context.in_f64(reference),
             targets: self.targets.in_f64(reference),
             target_images: self.target_images.in_f64(reference),
+            target_weights: None, // of seeded views, which have no masks
         }
     }
 }

@@ -78,20 +78,33 @@ impl ClipReader {
             cameras: frames.iter().map(camera).collect(),
             frame_index: frames.to_vec(),
         };
-        Ok(Clip { key: key.to_owned(), context: gather(&views.context), target: gather(&views.target) })
+        let num_pixels = self.options.width * self.options.height;
+        let weights = |frame: &usize| fitted[frame].2.clone().unwrap_or_else(|| vec![u8::MAX; num_pixels]);
+        let has_weights = views.target.iter().any(|frame| fitted[frame].2.is_some());
+        Ok(Clip {
+            key: key.to_owned(),
+            context: gather(&views.context),
+            target: gather(&views.target),
+            target_weights: has_weights.then(|| views.target.iter().flat_map(weights).collect()),
+        })
     }
 
-    fn fitted(
-        &self,
-        scene: usize,
-        frame: usize,
-        intrinsics: IntrinsicsNorm,
-    ) -> Result<(RgbImage, Intrinsics), DataError> {
+    /// Returns the image, its intrinsics, and the weights of its pixels if some are left out.
+    fn fitted(&self, scene: usize, frame: usize, intrinsics: IntrinsicsNorm) -> Result<Fitted, DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
-        fit_image(&self.source.frame(scene, frame)?, intrinsics, width, height, exact_principal_point)
-            .map_err(DataError::in_frame(self.source.key(scene), frame))
+        let fit = |image: &RgbImage| {
+            fit_image(image, intrinsics, width, height, exact_principal_point)
+                .map_err(DataError::in_frame(self.source.key(scene), frame))
+        };
+        let (image, coverage) = self.source.frame_with_coverage(scene, frame)?;
+        let weights = coverage.map(|coverage| fit(&coverage)).transpose()?;
+        let weights = weights.map(|(coverage, _)| coverage.rgb.into_iter().step_by(3).collect());
+        let (image, intrinsics) = fit(&image)?;
+        Ok((image, intrinsics, weights))
     }
 }
+
+type Fitted = (RgbImage, Intrinsics, Option<Vec<u8>>);
 
 #[cfg(test)]
 mod tests {

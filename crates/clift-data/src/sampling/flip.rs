@@ -15,7 +15,15 @@ impl Clip {
     // column. Its intrinsics stay, which is correct only for a principal point at the centre.
     #[must_use]
     pub fn flipped(&self) -> Self {
-        Self { key: self.key.clone(), context: flipped(&self.context), target: flipped(&self.target) }
+        let rows = |weights: &Vec<u8>| {
+            weights.chunks_exact(self.target.width.max(1)).flat_map(|row| row.iter().rev()).copied().collect()
+        };
+        Self {
+            key: self.key.clone(),
+            context: flipped(&self.context),
+            target: flipped(&self.target),
+            target_weights: self.target_weights.as_ref().map(rows),
+        }
     }
 }
 

@@ -123,7 +123,12 @@ mod tests {
                 cameras: vec![camera; frame_index.len()],
                 frame_index: frame_index.to_vec(),
             };
-            Ok(Clip { key: keys[scene].clone(), context: only(&views.context), target: only(&views.target) })
+            Ok(Clip {
+                key: keys[scene].clone(),
+                context: only(&views.context),
+                target: only(&views.target),
+                target_weights: None,
+            })
         };
         TrainingClips::new(source, Arc::new(read), ViewSampler::default(), batch_size, seed).unwrap()
     }
@@ -145,7 +150,7 @@ mod tests {
         let rare = (0..300).map(|scene| if scene % 23 == 5 { 90 } else { 10 + scene % 17 }).collect();
         for (clips, expected) in [(mixed().with_flip(true), 0xd652_d9cf), (clips(rare, 8, 12345), 0x1fc9_670d)] {
             let line = |step: u64, (clips, skipped): (Vec<Clip>, Vec<SkippedScene>)| {
-                let clips = clips.iter().map(|Clip { key, context, target }| {
+                let clips = clips.iter().map(|Clip { key, context, target, .. }| {
                     (key, &context.frame_index, &target.frame_index, context.cameras[0].c2w.translation[0])
                 });
                 let skips = skipped.iter().map(|skip| (&skip.key, &skip.reason));

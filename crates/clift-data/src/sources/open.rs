@@ -153,6 +153,7 @@ impl SplitFolder<'_> {
                 min_size: options.min_size,
                 poses_from: files.poses_from,
                 undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
+                background: options.background,
             },
             filters: options.filters.clone(),
             whole_scenes: (is_dl3dv || kind == SourceKind::Re10kTxt) && !files.keep_incomplete,

@@ -43,6 +43,8 @@ pub struct EvalResults {
     pub(crate) context_targets: BTreeSet<(String, usize)>,
     /// Keys of the scenes that the models were trained on.
     pub(crate) training_scenes: BTreeSet<String>,
+    /// Share of the pixels that masks leave out, of targets with a mask, by scene and frame.
+    pub(crate) masked: BTreeMap<String, BTreeMap<usize, f64>>,
 }
 
 impl EvalResults {
@@ -83,6 +85,7 @@ impl EvalResults {
         self.not_measured.extend(other.not_measured);
         self.selection = self.selection.or(other.selection);
         self.context_targets.extend(other.context_targets);
+        self.masked.extend(other.masked);
     }
 
     /// Iterates over the views of every key, in the order of keys.

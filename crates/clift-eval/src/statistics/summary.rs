@@ -119,6 +119,8 @@ pub struct Summary {
     pub num_context_targets: usize,
     /// Scenes that the models were trained on.
     pub training_scenes: BTreeSet<String>,
+    /// Share of the target pixels that masks leave out of the metrics; `null` without masks.
+    pub masked_share: Option<f64>,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
     /// SHA-256 of the LPIPS weights.
@@ -156,6 +158,7 @@ impl Summary {
             .map(|(key, views)| SummaryPoint::new(results, key, views))
             .collect();
         mark_fronts(&mut points);
+        let masked: f64 = results.masked.values().flat_map(BTreeMap::values).sum();
         Self {
             num_scenes: scenes.len(),
             num_views: views.len(),
@@ -163,6 +166,7 @@ impl Summary {
             split: results.split,
             num_context_targets: results.context_targets.len(),
             training_scenes: results.training_scenes.clone(),
+            masked_share: (!results.masked.is_empty()).then(|| masked / views.len().max(1) as f64),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
@@ -337,6 +341,7 @@ mod tests {
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
         views.training_scenes.insert("a".into());
+        views.masked.insert("a".into(), [(0, 0.25)].into());
         let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
@@ -348,6 +353,7 @@ mod tests {
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
             "training_scenes": ["a"],
+            "masked_share": 0.25,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],

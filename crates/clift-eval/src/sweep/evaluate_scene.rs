@@ -43,7 +43,7 @@ pub fn evaluate_scene(
     let device = &models.stage1.device;
     let context = Views::upload(&[&clip.context], device)?;
     let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
-    let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
+    let scorer = ViewScorer::new(clip, sweep.lpips.as_ref());
     let renderer = TargetRenderer { clip, scorer: &scorer, cameras: Cameras::upload(&[&clip.target], device)?, sweep };
     let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
     for rendering in &results.renderings {
@@ -51,6 +51,11 @@ pub fn evaluate_scene(
     }
     let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
     metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
+    for (view, &frame) in clip.target.frame_index.iter().enumerate() {
+        if let Some((_, share)) = scorer.weights(view) {
+            metrics.masked.entry(clip.key.clone()).or_default().insert(frame, 1.0 - share);
+        }
+    }
     let mut jobs = Vec::new();
     if models.supports_clusters() {
         add_jobs(models, &context, &renderer, &kept_views, &mut jobs, (&mut results, metrics))?;

@@ -38,7 +38,7 @@ pub(crate) fn backward(
     let pass = device_batch.pass(model, &token_step);
     let last = leaf(inputs.pop().expect("the first input"));
     let rendering = Rendering::of(&pass, last.clone(), step);
-    let parts = loss.of(&rendering, device_batch.target_images.clone());
+    let parts = device_batch.loss(loss, rendering);
     let mut grads = parts.total.clone().mul_scalar(share).backward();
     let parts = LossParts { total: parts.total.inner(), mse: parts.mse.inner() };
     let mut gradient = StateGradient::take(&last, &mut grads);

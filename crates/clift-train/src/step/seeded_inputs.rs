@@ -30,7 +30,7 @@ pub fn seeded_clip(shape: ClipShape, seed: u64, slot: usize) -> Clip {
     let context = (0..num_context).map(|view| along(num_context, view)).collect();
     let target = (0..num_targets).map(|view| 0.9 * along(num_targets, view)).collect();
     let context = views(context, size, &mut rng);
-    Clip { key: format!("bench-{slot}"), context, target: views(target, size, &mut rng) }
+    Clip { key: format!("bench-{slot}"), context, target: views(target, size, &mut rng), target_weights: None }
 }
 
 /// Makes views at positions in `[-1, 1]` of the arc.
