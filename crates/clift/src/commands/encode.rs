@@ -42,7 +42,7 @@ pub struct EncodeArgs {
     pub split: Split,
     /// Context frames by position or file name [default: spread along the path]
     ///
-    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
+    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension and folders:
     /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. Numbers alone are positions, unless one begins with a zero:
     /// `0005` is a name. By default, as many as in training; of a DIR of the command line, every fourth frame, up to three
     /// times as many, if the network has camera-relative attention.
