@@ -16,7 +16,7 @@ use crate::commands::data::check::{self, CheckArgs};
 use crate::commands::data::colmap::{Colmap, Settings};
 use crate::commands::data::tool::Tool;
 use crate::exit_code::{Interrupted, usage_bail};
-use crate::interrupt;
+use crate::interrupt::{self, Ending};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result, print_warning};
 
@@ -47,7 +47,10 @@ struct Capture {
 }
 
 pub fn run(args: &PosesArgs) -> anyhow::Result<()> {
-    let stop = interrupt::flag()?;
+    let stop = interrupt::flag(Ending {
+        first: "stopping COLMAP; the same command continues\n",
+        second: "ended; the same command continues\n",
+    })?;
     let capture = Capture::new(&args.out);
     let tool = |name, package| Tool { name, package, log: capture.work.join("log.txt"), stop: &stop };
     tool("colmap", "colmap").output(&["help".as_ref()])?;
