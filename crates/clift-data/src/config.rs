@@ -100,6 +100,7 @@ impl DataConfig {
             pose_rotation: self.pose_rotation,
             pose_scale: self.pose_scale,
             exact_principal_point: self.crop == Crop::Exact,
+            half_size: false,
         }
     }
 }

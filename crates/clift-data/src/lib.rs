@@ -34,7 +34,7 @@ mod torch;
 
 // Opening a data set.
 pub use config::DataConfig;
-pub use dataset::{half_resolution_clips, open_dataset, open_training_dataset};
+pub use dataset::{half_size_reader, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
 pub use scene_source::{SceneSource, Split, is_held_out};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
@@ -62,7 +62,7 @@ pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views
 pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
-pub use sampling::training_clips::{ReadClip, TrainingClips};
+pub use sampling::training_clips::TrainingClips;
 pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Lenses, files of poses, and measures on poses.

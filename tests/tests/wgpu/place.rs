@@ -6,7 +6,7 @@ use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use clift_core::{Camera, ClipViews, DMat3, DVec3, Intrinsics, Pose};
 use clift_data::Clip;
 use clift_model::{
-    Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, ModelConfig, Renderer, SceneClusters,
+    Cameras, CliftVariant, Condenser, CondenserConfig, Encoder, Init, ModelConfig, Network, Renderer, SceneClusters,
     Views,
 };
 use rand::{RngExt, SeedableRng};
@@ -71,9 +71,9 @@ impl Place {
         make(&mut Init::of(network, 7, &self.device)).map(&mut Move)
     }
 
-    pub fn model(&self) -> Clift {
+    pub fn model(&self) -> Network {
         let config = network(CliftVariant::Paper);
-        self.module(|init| Clift {
+        self.module(|init| Network {
             encoder: Encoder::new(&config, init),
             renderer: Renderer::new(&config, init),
             condenser: Condenser::new(&config, init),

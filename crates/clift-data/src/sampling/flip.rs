@@ -53,7 +53,7 @@ mod tests {
     use crate::scene_source::SceneSource;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{TestSource, rooms};
-    use clift_core::{PoseRotation, PoseScale, RgbImage};
+    use clift_core::{PoseRotation, RgbImage};
     use std::sync::Arc;
 
     fn mirrored(source: SyntheticSource) -> TestSource {
@@ -80,8 +80,8 @@ mod tests {
             width: size[0],
             height: size[1],
             pose_rotation: rotation,
-            pose_scale: PoseScale::Context,
             exact_principal_point: true,
+            ..ClipOptions::default()
         };
         let views = ViewIndices { context: vec![0, 3, 8], target: vec![5, 5] };
         ClipReader { source, options }.read(0, &views).unwrap()

@@ -4,7 +4,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::ClipViews;
 use clift_data::Clip;
-use clift_model::{Cameras, Clift, Pass, TokenStep, Views, upload_images};
+use clift_model::{Cameras, Network, Pass, TokenStep, Views, upload_images};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -86,7 +86,11 @@ impl DeviceBatch {
     }
 
     /// Describes the forward pass of a model from the context views to images of the target views.
-    pub(crate) fn pass<'a>(&'a self, model: &'a Clift, token_step: TokenStep<'a, TrainError>) -> Pass<'a, TrainError> {
+    pub(crate) fn pass<'a>(
+        &'a self,
+        model: &'a Network,
+        token_step: TokenStep<'a, TrainError>,
+    ) -> Pass<'a, TrainError> {
         Pass::new(model, &self.context, &self.targets, token_step)
     }
 }
@@ -96,7 +100,7 @@ impl DeviceBatch {
 /// # Errors
 /// Those of clusters that do not fit the tokens.
 pub fn render_loss(
-    model: &Clift,
+    model: &Network,
     device_batch: &DeviceBatch,
     batch_tokens: &BatchTokens,
     loss: &Loss,
