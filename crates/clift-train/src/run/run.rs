@@ -145,10 +145,10 @@ impl Run {
             return self.ranks.is_root().then(|| read_finished(&self.config.run_dir, sink)).transpose();
         }
         if self.ranks.is_root() && !is_trained && summary.exists() {
-            // Of former weights: of stage 1 alone, or before `--extend`.
+            // Of former weights, of stage 1 alone.
             std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
         }
-        let steps: [(RunStep, bool, MakeStep); 5] = [
+        let steps: [(RunStep, bool, MakeStep<'_>); 5] = [
             (Stage::Stage1.into(), has_stage1, Training::train_stage1),
             (RunStep::Clusters, has_stage2 && only.is_none(), Training::make_clusters),
             (Stage::Stage2.into(), has_stage2, Training::train_stage2),
@@ -360,7 +360,7 @@ impl Run {
 }
 
 /// Makes a step of a run.
-type MakeStep = fn(&mut Training, &mut dyn Sink) -> Result<(), TrainError>;
+type MakeStep<'a> = fn(&mut Training<'a>, &mut dyn Sink) -> Result<(), TrainError>;
 
 /// What the steps of a training share: the data, and the results of the steps made so far.
 struct Training<'a> {
