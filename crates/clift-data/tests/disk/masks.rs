@@ -70,6 +70,7 @@ fn masked_and_transparent_pixels_have_the_background_and_no_weight() {
 fn clips_have_weights_of_targets_where_a_target_has_a_mask() {
     let (root, opened) = capture(&[("masks/a.png", mask(255))], &json!({}));
     let options = ClipOptions {
+        half_size: false,
         width: 16,
         height: 16,
         pose_rotation: PoseRotation::Quaternion,
