@@ -1,0 +1,340 @@
+//! Attention of heads, forward and backward, in time and memory without score matrices.
+
+use cubecl::prelude::*;
+
+use crate::buffer::{Buffer, Values};
+use crate::register_attention::{self as register, ROWS, UNITS};
+
+/// Sizes of an attention.
+#[derive(Clone, Copy, Debug)]
+pub struct AttentionSizes {
+    /// Number of scenes.
+    pub batch: usize,
+    /// Heads of a scene.
+    pub num_heads: usize,
+    /// Queries of a scene.
+    pub num_queries: usize,
+    /// Keys of a scene.
+    pub num_keys: usize,
+    /// Channels of a head, at most 128.
+    pub head_width: usize,
+}
+
+/// Rows with the heads of a token, from column `column` of `stride` columns; the rows of a scene follow those of another.
+#[derive(Clone, Debug)]
+pub struct HeadRows<'a> {
+    /// The values.
+    pub buffer: &'a Buffer,
+    /// Column of the first head.
+    pub column: usize,
+    /// Columns of a row.
+    pub stride: usize,
+}
+
+/// Queries, keys and values.
+#[derive(Clone, Debug)]
+pub struct AttentionInputs<'a> {
+    /// Queries.
+    pub query: HeadRows<'a>,
+    /// Keys.
+    pub key: HeadRows<'a>,
+    /// Values.
+    pub value: HeadRows<'a>,
+}
+
+/// The rows of a buffer.
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
+pub(crate) struct Rows {
+    pub(crate) start: usize,
+    pub(crate) stride: usize,
+    pub(crate) count: usize,
+}
+
+/// A scene and the first column of a head.
+#[derive(CubeType, Clone, Copy)]
+pub(crate) struct Head {
+    pub(crate) batch: usize,
+    pub(crate) column: usize,
+}
+
+#[cube]
+impl Rows {
+    /// Returns the offset of the head's first row.
+    pub(crate) fn start_of(&self, head: &Head) -> usize {
+        self.start + head.batch * self.count * self.stride + head.column
+    }
+}
+
+/// Returns the head of a cube: the second position counts scenes and heads.
+#[cube]
+pub(crate) fn head_of_cube(num_heads: usize, width: usize) -> Head {
+    Head { batch: CUBE_POS_Y as usize / num_heads, column: CUBE_POS_Y as usize % num_heads * width }
+}
+
+impl AttentionSizes {
+    fn dim(self) -> usize {
+        self.num_heads * self.head_width
+    }
+
+    fn scale(self) -> f32 {
+        (1.0 / (self.head_width as f64).sqrt()) as f32
+    }
+
+    fn cubes(self, count: usize, rows: usize) -> CubeCount {
+        CubeCount::Static(count.div_ceil(rows) as u32, (self.batch * self.num_heads) as u32, 1)
+    }
+
+    /// Returns the width of the vectors of which heads and rows are made.
+    fn vector(self, rows: &[&HeadRows]) -> usize {
+        let aligned = |x: usize| x.is_multiple_of(4);
+        let all = rows.iter().all(|rows| aligned(rows.column) && aligned(rows.stride) && aligned(rows.buffer.len));
+        if all && aligned(self.head_width) { 4 } else { 1 }
+    }
+}
+
+fn rows(rows: &HeadRows, count: usize) -> RowsLaunch {
+    RowsLaunch::new(rows.column, rows.stride, count)
+}
+
+/// Computes `softmax(q k^T / sqrt(E)) v` of every head, `[batch, queries, heads E]` in f32, and the log sums of the scores,
+/// `[batch, heads, queries]`.
+pub fn attention_forward(client: &Client, sizes: AttentionSizes, inputs: &AttentionInputs) -> [Buffer; 2] {
+    let AttentionSizes { batch, num_heads, num_queries, num_keys, head_width } = sizes;
+    let output = Buffer::empty(client, batch * num_queries * sizes.dim(), Values::F32);
+    let log_sum = Buffer::empty(client, batch * num_heads * num_queries, Values::F32);
+    let AttentionInputs { query, key, value } = inputs;
+    let to = HeadRows { buffer: &output, column: 0, stride: sizes.dim() };
+    let vector = sizes.vector(&[query, key, value, &to]);
+    // SAFETY: the kernel reads and writes inside the counts of the rows.
+    unsafe {
+        register::forward::launch_unchecked(
+            client,
+            sizes.cubes(num_queries, ROWS),
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            query.buffer.arg(vector),
+            key.buffer.arg(vector),
+            value.buffer.arg(vector),
+            output.arg(vector),
+            log_sum.arg(1),
+            rows(query, num_queries),
+            rows(key, num_keys),
+            rows(value, num_keys),
+            rows(&to, num_queries),
+            num_heads,
+            sizes.scale(),
+            head_width,
+            query.buffer.values.elem(),
+        );
+    }
+    [output, log_sum]
+}
+
+/// Results of the forward, and the gradient of the output.
+#[derive(Clone, Copy, Debug)]
+pub struct AttentionResults<'a> {
+    /// Output of the forward.
+    pub output: &'a Buffer,
+    /// Log sums of the forward.
+    pub log_sum: &'a Buffer,
+    /// Gradient of the output, in f32 and in its layout.
+    pub grad_output: &'a Buffer,
+}
+
+/// Writes the gradients of queries, keys and values to the rows of `grads`, in f32; keys and values share a buffer.
+pub fn attention_backward(
+    client: &Client,
+    sizes: AttentionSizes,
+    inputs: &AttentionInputs,
+    results: AttentionResults,
+    grads: &AttentionInputs,
+) {
+    let AttentionSizes { batch, num_heads, num_queries, num_keys, head_width } = sizes;
+    let AttentionInputs { query, key, value } = inputs;
+    let delta = Buffer::empty(client, batch * num_heads * num_queries, Values::F32);
+    let units = 64;
+    // SAFETY: the kernel reads and writes inside the number of rows.
+    unsafe {
+        delta_kernel::launch_unchecked(
+            client,
+            CubeCount::Static((batch * num_queries * num_heads).div_ceil(units) as u32, 1, 1),
+            CubeDim::new_1d(units as u32),
+            results.output.arg(1),
+            results.grad_output.arg(1),
+            delta.arg(1),
+            num_queries,
+            num_heads,
+            head_width,
+        );
+    }
+    let grad_output = HeadRows { buffer: results.grad_output, column: 0, stride: sizes.dim() };
+    let vector = sizes.vector(&[query, key, value, &grad_output, &grads.query, &grads.key, &grads.value]);
+    // SAFETY: the kernels read and write inside the counts of the rows.
+    unsafe {
+        register::backward_by_queries::launch_unchecked(
+            client,
+            sizes.cubes(num_queries, ROWS),
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            query.buffer.arg(vector),
+            key.buffer.arg(vector),
+            value.buffer.arg(vector),
+            grad_output.buffer.arg(vector),
+            results.log_sum.arg(1),
+            delta.arg(1),
+            grads.query.buffer.arg(vector),
+            rows(query, num_queries),
+            rows(key, num_keys),
+            rows(value, num_keys),
+            rows(&grad_output, num_queries),
+            rows(&grads.query, num_queries),
+            num_heads,
+            sizes.scale(),
+            head_width,
+            query.buffer.values.elem(),
+        );
+        register::backward_by_keys::launch_unchecked(
+            client,
+            sizes.cubes(num_keys, ROWS),
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            query.buffer.arg(vector),
+            key.buffer.arg(vector),
+            value.buffer.arg(vector),
+            grad_output.buffer.arg(vector),
+            results.log_sum.arg(1),
+            delta.arg(1),
+            grads.key.buffer.arg(vector),
+            rows(query, num_queries),
+            rows(key, num_keys),
+            rows(value, num_keys),
+            rows(&grad_output, num_queries),
+            rows(&grads.key, num_keys),
+            rows(&grads.value, num_keys),
+            num_heads,
+            sizes.scale(),
+            head_width,
+            query.buffer.values.elem(),
+        );
+    }
+}
+
+/// Computes the sums `dO O` of the channels of every head, `[batch, heads, queries]`.
+#[cube(launch_unchecked)]
+fn delta_kernel(
+    output: &[f32],
+    grad_output: &[f32],
+    delta: &mut [f32],
+    num_queries: usize,
+    num_heads: usize,
+    #[comptime] width: usize,
+) {
+    let index = ABSOLUTE_POS as usize;
+    if index < delta.len() {
+        // The heads of a row lie side by side.
+        let row = index / num_heads;
+        let head = index % num_heads;
+        let mut sum = 0.0f32;
+        for e in 0..width {
+            sum = fma(output[index * width + e], grad_output[index * width + e], sum);
+        }
+        delta[(row / num_queries * num_heads + head) * num_queries + row % num_queries] = sum;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{client, random, read, upload};
+
+    /// Output, log sums, and gradients of queries, keys and values, of one head in f64.
+    fn reference(q: &[f64], k: &[f64], v: &[f64], grad: &[f64], width: usize) -> [Vec<f64>; 5] {
+        let (nq, nk) = (q.len() / width, k.len() / width);
+        let scale = 1.0 / (width as f64).sqrt();
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let line = |x: &[f64], i: usize| x[i * width..(i + 1) * width].to_vec();
+        let [mut out, mut dq] = [vec![0.0; q.len()], vec![0.0; q.len()]];
+        let [mut dk, mut dv] = [vec![0.0; k.len()], vec![0.0; k.len()]];
+        let mut logs = vec![0.0; nq];
+        for i in 0..nq {
+            let scores: Vec<f64> = (0..nk).map(|j| scale * dot(&line(q, i), &line(k, j))).collect();
+            let largest = scores.iter().copied().fold(f64::MIN, f64::max);
+            logs[i] = largest + scores.iter().map(|s| (s - largest).exp()).sum::<f64>().ln();
+            let weights: Vec<f64> = scores.iter().map(|s| (s - logs[i]).exp()).collect();
+            for j in 0..nk {
+                for e in 0..width {
+                    out[i * width + e] += weights[j] * v[j * width + e];
+                }
+            }
+            let delta = dot(&line(grad, i), &line(&out, i));
+            for j in 0..nk {
+                let slope = scale * weights[j] * (dot(&line(grad, i), &line(v, j)) - delta);
+                for e in 0..width {
+                    dv[j * width + e] += weights[j] * grad[i * width + e];
+                    dq[i * width + e] += slope * k[j * width + e];
+                    dk[j * width + e] += slope * q[i * width + e];
+                }
+            }
+        }
+        [out, logs, dq, dk, dv]
+    }
+
+    #[test]
+    fn attention_and_its_gradients_equal_f64() {
+        let client = client();
+        for [num_queries, num_keys, num_heads, head_width] in
+            [[1, 1, 2, 12], [70, 33, 1, 96], [65, 130, 2, 24], [7, 64, 1, 128], [5, 9, 2, 18]]
+        {
+            let batch = 2;
+            let sizes = AttentionSizes { batch, num_heads, num_queries, num_keys, head_width };
+            let dim = sizes.dim();
+            let lens = [num_queries * dim, num_keys * 2 * dim, num_queries * dim].map(|len| batch * len);
+            let [query, key_value, grad] = [0, 1, 2].map(|i| random(lens[i], i as u64).iter().map(|x| 2.0 * x).collect::<Vec<f32>>());
+            let [q, kv, g] = [&query, &key_value, &grad].map(|x| upload(&client, x, Values::F32));
+            let inputs = AttentionInputs {
+                query: HeadRows { buffer: &q, column: 0, stride: dim },
+                key: HeadRows { buffer: &kv, column: 0, stride: 2 * dim },
+                value: HeadRows { buffer: &kv, column: dim, stride: 2 * dim },
+            };
+            let [output, log_sum] = attention_forward(&client, sizes, &inputs);
+            let [grad_q, grad_kv] = [&q, &kv].map(|x| Buffer::empty(&client, x.len, Values::F32));
+            let grads = AttentionInputs {
+                query: HeadRows { buffer: &grad_q, ..inputs.query },
+                key: HeadRows { buffer: &grad_kv, ..inputs.key },
+                value: HeadRows { buffer: &grad_kv, ..inputs.value },
+            };
+            let results = AttentionResults { output: &output, log_sum: &log_sum, grad_output: &g };
+            attention_backward(&client, sizes, &inputs, results, &grads);
+            let [output, log_sum, grad_q, grad_kv] = [output, log_sum, grad_q, grad_kv].map(|x| read(&client, &x));
+            for b in 0..batch {
+                for h in 0..num_heads {
+                    let head = |x: &[f32], count: usize, stride: usize, column: usize| -> Vec<f64> {
+                        let row = |i: usize| (b * count + i) * stride + column + h * head_width;
+                        (0..count).flat_map(|i| x[row(i)..row(i) + head_width].iter().map(|&x| f64::from(x)).collect::<Vec<_>>()).collect()
+                    };
+                    let expected = reference(
+                        &head(&query, num_queries, dim, 0),
+                        &head(&key_value, num_keys, 2 * dim, 0),
+                        &head(&key_value, num_keys, 2 * dim, dim),
+                        &head(&grad, num_queries, dim, 0),
+                        head_width,
+                    );
+                    let first = (b * num_heads + h) * num_queries;
+                    let logs = log_sum[first..first + num_queries].iter().map(|&x| f64::from(x)).collect();
+                    let computed = [
+                        head(&output, num_queries, dim, 0),
+                        logs,
+                        head(&grad_q, num_queries, dim, 0),
+                        head(&grad_kv, num_keys, 2 * dim, 0),
+                        head(&grad_kv, num_keys, 2 * dim, dim),
+                    ];
+                    for (i, (computed, expected)) in computed.iter().zip(&expected).enumerate() {
+                        let size = expected.iter().map(|x| x.abs()).fold(1e-3, f64::max);
+                        let worst = computed.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                        assert!(worst < 1e-5 * size, "{sizes:?}, result {i}: {worst} of {size}");
+                    }
+                }
+            }
+        }
+    }
+}

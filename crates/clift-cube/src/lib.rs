@@ -1,0 +1,32 @@
+//! GPU kernels of clift, in CubeCL: buffers in, buffers out.
+#![cfg(feature = "wgpu")]
+
+mod adamw;
+mod adapter;
+mod attention;
+mod buffer;
+mod epilogue;
+mod gelu;
+mod layer_norm;
+mod load;
+mod matrix_attention;
+mod matrix_product;
+mod product;
+mod reduce;
+mod register_attention;
+mod register_product;
+mod rms_norm;
+#[cfg(test)]
+mod testing;
+
+pub use adamw::{AdamW, adamw, gradient_norm};
+pub use adapter::AdapterClass;
+pub use attention::{
+    AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward, attention_forward,
+};
+pub use buffer::{Buffer, Matrices, Values};
+pub use gelu::{gelu_backward, gelu_forward};
+pub use layer_norm::{layer_norm_backward, layer_norm_forward};
+pub use product::Product;
+pub use reduce::sum_rows;
+pub use rms_norm::{NormHeads, rms_norm_backward, rms_norm_forward};
