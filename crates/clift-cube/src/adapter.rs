@@ -24,8 +24,7 @@ impl AdapterClass {
         let properties = client.properties();
         let hardware = &properties.hardware;
         let plane = hardware.plane_size_min as usize;
-        let has_planes = [Plane::Ops, Plane::Sync].iter().all(|&x| properties.features.plane.contains(x));
-        if hardware.plane_size_max as usize != plane || !has_planes {
+        if hardware.plane_size_max as usize != plane || !properties.features.plane.contains(Plane::Sync) {
             return Self::Registers;
         }
         let [half, single] = [f16::elem_type_native(), f32::elem_type_native()];

@@ -296,6 +296,7 @@ pub(crate) fn forward<F: Float, V: Size>(
     let weight_row = row * comptime!(tile.pitches()[1]);
     let fours = comptime!(tile.fours());
 
+    let mut partial = Shared::<[f32]>::new_slice(comptime!(tile.units()));
     let queries = load_rows::<F, V>(&mut stage, query, &query_rows, &head, first_row, tile);
     let mut sums = zero_sums(comptime!(tile.matrices()[1]), tile);
     let mut values = Array::<Four<f32>>::new(fours);
@@ -324,8 +325,8 @@ pub(crate) fn forward<F: Float, V: Size>(
             }
         }
         // Of all units of the row.
-        largest = max_of_row(largest, tile);
-        if plane_any(largest > maximum + LEEWAY) {
+        largest = max_of_row(&mut partial, largest, tile);
+        if max_of_plane(&mut partial, largest - maximum, tile) > LEEWAY {
             let raised = max(maximum, largest);
             let decay = (maximum - raised).exp();
             maximum = raised;
@@ -349,35 +350,54 @@ pub(crate) fn forward<F: Float, V: Size>(
     for j in 0..4usize {
         sum += total.extract(j);
     }
-    sum = sum_of_row(sum, tile);
+    sum = sum_of_row(&mut partial, sum, tile);
     write_sums::<V>(output, &sums, &mut scores, 1.0 / sum, &output_rows, &head, first_row, tile);
     if UNIT_POS as usize % comptime!(tile.lanes()) == 0 && first_row + row < query_rows.count {
         log_sum[CUBE_POS_Y as usize * query_rows.count + first_row + row] = maximum + sum.ln();
     }
 }
 
-/// Returns the maximum of the units of a row, which lie side by side and are one or two.
+/// Writes a value of every unit where the others of its plane read it.
 #[cube]
-fn max_of_row(value: f32, #[comptime] tile: AttentionTile) -> f32 {
+fn share(stage: &mut [f32], value: f32) {
+    sync_plane();
+    stage[UNIT_POS as usize] = value;
+    sync_plane();
+}
+
+/// Returns the maximum of the units of a row.
+#[cube]
+fn max_of_row(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) -> f32 {
+    share(stage, value);
     let mut result = value;
-    if comptime!(tile.lanes() > 1) {
-        result = max(result, plane_shuffle_xor(result, 1));
-    }
-    if comptime!(tile.lanes() > 2) {
-        result = max(result, plane_shuffle_xor(result, 2));
+    #[unroll]
+    for i in 0..comptime!(tile.lanes()) {
+        result = max(result, stage[row_of_unit(tile) * comptime!(tile.lanes()) + i]);
     }
     result
 }
 
 /// Returns the sum of the units of a row.
 #[cube]
-fn sum_of_row(value: f32, #[comptime] tile: AttentionTile) -> f32 {
-    let mut result = value;
-    if comptime!(tile.lanes() > 1) {
-        result += plane_shuffle_xor(result, 1);
+fn sum_of_row(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) -> f32 {
+    share(stage, value);
+    let mut result = 0.0f32;
+    #[unroll]
+    for i in 0..comptime!(tile.lanes()) {
+        result += stage[row_of_unit(tile) * comptime!(tile.lanes()) + i];
     }
-    if comptime!(tile.lanes() > 2) {
-        result += plane_shuffle_xor(result, 2);
+    result
+}
+
+/// Returns the maximum of the units of the plane.
+#[cube]
+fn max_of_plane(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) -> f32 {
+    share(stage, value);
+    let plane = comptime!(tile.shape.plane);
+    let first = UNIT_POS as usize / plane * plane;
+    let mut result = value;
+    for i in 0..plane {
+        result = max(result, stage[first + i]);
     }
     result
 }

@@ -39,7 +39,8 @@ fn norm<V: Size>(
     #[comptime] is_gradient: bool,
 ) {
     let mut stage = Shared::<[f32]>::new_slice(HEADS * LANES);
-    let vectors = comptime!(width / V::value());
+    let vector = V::value().comptime();
+    let vectors = comptime!(width / vector);
     let lane = UNIT_POS as usize % LANES;
     let all_heads = rows * num_parts * num_heads;
     let index = (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * HEADS + UNIT_POS as usize / LANES;
