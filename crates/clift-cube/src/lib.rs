@@ -5,8 +5,10 @@ mod adamw;
 mod adapter;
 mod attention;
 mod buffer;
+mod cluster_attention;
 mod epilogue;
 mod gelu;
+mod head_transform;
 mod layer_norm;
 mod load;
 mod matrix_attention;
@@ -25,7 +27,9 @@ pub use attention::{
     AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward, attention_forward,
 };
 pub use buffer::{Buffer, Matrices, Values};
+pub use cluster_attention::{ClusterSizes, cluster_attention_backward, cluster_attention_forward};
 pub use gelu::{gelu_backward, gelu_forward};
+pub use head_transform::{PartTransform, transform_heads};
 pub use layer_norm::{layer_norm_backward, layer_norm_forward};
 pub use product::Product;
 pub use reduce::sum_rows;
