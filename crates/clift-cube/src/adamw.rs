@@ -55,7 +55,13 @@ fn update<V: Size>(
 }
 
 /// Updates a parameter, the mean of its gradients and the mean of their squares by a gradient, multiplied by `factor: [1]`.
-pub fn adamw(client: &Client, settings: AdamW, [parameter, mean, square]: [&Buffer; 3], grad: &Buffer, factor: &Buffer) {
+pub fn adamw(
+    client: &Client,
+    settings: AdamW,
+    [parameter, mean, square]: [&Buffer; 3],
+    grad: &Buffer,
+    factor: &Buffer,
+) {
     let (vector, count) = elementwise(grad.len);
     let AdamW { learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon } = settings;
     // SAFETY: the kernel compares its index with the length.

@@ -2,8 +2,9 @@
 
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
 use crate::adapter::AdapterClass;
+use crate::buffer::{Buffer, Values};
+use crate::head_rows::RowsLaunch;
 use crate::matrix_attention as matrix;
 use crate::register_attention::{self as register, ROWS, UNITS};
 
@@ -44,35 +45,6 @@ pub struct AttentionInputs<'a> {
     pub key: HeadRows<'a>,
     /// Values.
     pub value: HeadRows<'a>,
-}
-
-/// The rows of a buffer.
-#[derive(CubeType, CubeLaunch, Clone, Copy)]
-pub(crate) struct Rows {
-    pub(crate) start: usize,
-    pub(crate) stride: usize,
-    pub(crate) count: usize,
-}
-
-/// A scene and the first column of a head.
-#[derive(CubeType, Clone, Copy)]
-pub(crate) struct Head {
-    pub(crate) batch: usize,
-    pub(crate) column: usize,
-}
-
-#[cube]
-impl Rows {
-    /// Returns the offset of the head's first row.
-    pub(crate) fn start_of(&self, head: &Head) -> usize {
-        self.start + head.batch * self.count * self.stride + head.column
-    }
-}
-
-/// Returns the head of a cube: the second position counts scenes and heads.
-#[cube]
-pub(crate) fn head_of_cube(num_heads: usize, width: usize) -> Head {
-    Head { batch: CUBE_POS_Y as usize / num_heads, column: CUBE_POS_Y as usize % num_heads * width }
 }
 
 impl AttentionSizes {
@@ -126,19 +98,28 @@ pub fn attention_forward(client: &Client, sizes: AttentionSizes, inputs: &Attent
     let tile = AdapterClass::of(client).attention_tile(operands, head_width);
     // SAFETY: the kernels read and write inside the counts of the rows.
     unsafe {
-        launch!(tile, forward, client, sizes, num_queries, vector, [
-            query.buffer.arg(vector),
-            key.buffer.arg(vector),
-            value.buffer.arg(vector),
-            output.arg(vector),
-            log_sum.arg(1),
-            rows(query, num_queries),
-            rows(key, num_keys),
-            rows(value, num_keys),
-            rows(&to, num_queries),
-            num_heads,
-            scale
-        ], elem);
+        launch!(
+            tile,
+            forward,
+            client,
+            sizes,
+            num_queries,
+            vector,
+            [
+                query.buffer.arg(vector),
+                key.buffer.arg(vector),
+                value.buffer.arg(vector),
+                output.arg(vector),
+                log_sum.arg(1),
+                rows(query, num_queries),
+                rows(key, num_keys),
+                rows(value, num_keys),
+                rows(&to, num_queries),
+                num_heads,
+                scale
+            ],
+            elem
+        );
     }
     [output, log_sum]
 }
@@ -186,39 +167,57 @@ pub fn attention_backward(
     let tile = AdapterClass::of(client).attention_tile(operands, head_width);
     // SAFETY: the kernels read and write inside the counts of the rows.
     unsafe {
-        launch!(tile, backward_by_queries, client, sizes, num_queries, vector, [
-            query.buffer.arg(vector),
-            key.buffer.arg(vector),
-            value.buffer.arg(vector),
-            grad_output.buffer.arg(vector),
-            results.log_sum.arg(1),
-            delta.arg(1),
-            grads.query.buffer.arg(vector),
-            rows(query, num_queries),
-            rows(key, num_keys),
-            rows(value, num_keys),
-            rows(&grad_output, num_queries),
-            rows(&grads.query, num_queries),
-            num_heads,
-            scale
-        ], elem);
-        launch!(tile, backward_by_keys, client, sizes, num_keys, vector, [
-            query.buffer.arg(vector),
-            key.buffer.arg(vector),
-            value.buffer.arg(vector),
-            grad_output.buffer.arg(vector),
-            results.log_sum.arg(1),
-            delta.arg(1),
-            grads.key.buffer.arg(vector),
-            rows(query, num_queries),
-            rows(key, num_keys),
-            rows(value, num_keys),
-            rows(&grad_output, num_queries),
-            rows(&grads.key, num_keys),
-            rows(&grads.value, num_keys),
-            num_heads,
-            scale
-        ], elem);
+        launch!(
+            tile,
+            backward_by_queries,
+            client,
+            sizes,
+            num_queries,
+            vector,
+            [
+                query.buffer.arg(vector),
+                key.buffer.arg(vector),
+                value.buffer.arg(vector),
+                grad_output.buffer.arg(vector),
+                results.log_sum.arg(1),
+                delta.arg(1),
+                grads.query.buffer.arg(vector),
+                rows(query, num_queries),
+                rows(key, num_keys),
+                rows(value, num_keys),
+                rows(&grad_output, num_queries),
+                rows(&grads.query, num_queries),
+                num_heads,
+                scale
+            ],
+            elem
+        );
+        launch!(
+            tile,
+            backward_by_keys,
+            client,
+            sizes,
+            num_keys,
+            vector,
+            [
+                query.buffer.arg(vector),
+                key.buffer.arg(vector),
+                value.buffer.arg(vector),
+                grad_output.buffer.arg(vector),
+                results.log_sum.arg(1),
+                delta.arg(1),
+                grads.key.buffer.arg(vector),
+                rows(query, num_queries),
+                rows(key, num_keys),
+                rows(value, num_keys),
+                rows(&grad_output, num_queries),
+                rows(&grads.key, num_keys),
+                rows(&grads.value, num_keys),
+                num_heads,
+                scale
+            ],
+            elem
+        );
     }
 }
 

@@ -42,14 +42,7 @@ struct Groups {
 
 /// Sorts the members of a scene by segment, by counting those before them.
 #[cube(launch_unchecked)]
-fn group(
-    segment: &[i32],
-    order: &mut [u32],
-    first: &mut [u32],
-    batch: usize,
-    num_segments: usize,
-    num_members: usize,
-) {
+fn group(segment: &[i32], order: &mut [u32], first: &mut [u32], batch: usize, num_segments: usize, num_members: usize) {
     let index = ABSOLUTE_POS as usize;
     let units = num_members + num_segments;
     if index < batch * units {
@@ -334,7 +327,8 @@ mod tests {
         for (num_heads, width) in [(2, 12), (1, 5)] {
             let dim = num_heads * width;
             let sizes = ClusterSizes { batch: 2, num_segments: 4, num_members: 7, num_heads, head_width: width };
-            let [query, key_value, grad] = [(8 * dim, 1), (14 * 2 * dim, 2), (8 * dim, 3)].map(|(len, seed)| random(len, seed));
+            let [query, key_value, grad] =
+                [(8 * dim, 1), (14 * 2 * dim, 2), (8 * dim, 3)].map(|(len, seed)| random(len, seed));
             let [q, kv, g] = [&query, &key_value, &grad].map(|x| upload(&client, x, Values::F32));
             let [output, weights] = cluster_attention_forward(&client, sizes, [&q, &kv, &segment]);
             let [grad_q, grad_kv] =

@@ -82,7 +82,15 @@ pub fn gelu_forward(client: &Client, x: &Buffer, output: Values) -> Buffer {
     let types = [x.values.elem(), output.values.elem()];
     // SAFETY: the kernel compares its index with the length.
     unsafe {
-        forward::launch_unchecked(client, count, CubeDim::new_1d(UNITS as u32), vector, x.arg(vector), output.arg(vector), types);
+        forward::launch_unchecked(
+            client,
+            count,
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            x.arg(vector),
+            output.arg(vector),
+            types,
+        );
     }
     output
 }

@@ -135,11 +135,7 @@ pub fn layer_norm_forward(
 }
 
 /// Computes the gradient of `x`, and those of gamma and beta, one after the other.
-pub fn layer_norm_backward(
-    client: &Client,
-    [x, gamma, statistics]: [&Buffer; 3],
-    grad: &Buffer,
-) -> [Buffer; 2] {
+pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3], grad: &Buffer) -> [Buffer; 2] {
     let columns = gamma.len;
     let rows = x.len / columns;
     let vector = vector(columns);
@@ -184,7 +180,8 @@ mod tests {
             let mut expected_sums = vec![0.0; 2 * columns];
             let n = columns as f64;
             for row in 0..rows {
-                let line = |x: &[f32]| -> Vec<f64> { x[row * columns..][..columns].iter().map(|&x| f64::from(x)).collect() };
+                let line =
+                    |x: &[f32]| -> Vec<f64> { x[row * columns..][..columns].iter().map(|&x| f64::from(x)).collect() };
                 let (x, grad) = (line(&x), line(&grad));
                 let mean = x.iter().sum::<f64>() / n;
                 let inverse = 1.0 / (x.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n + 1e-5).sqrt();

@@ -10,10 +10,9 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use half::f16;
 
-use crate::attention::{Head, Rows, head_of_cube};
+use crate::head_rows::{Head, Rows, head_of_cube, read_rows, write_values};
 use crate::load::{Four, load_four};
 use crate::matrix_product::{MatrixShape, PAD, load_matrix};
-use crate::register_attention::write_values;
 
 /// How far scores may exceed the maximum by which weights are divided: weights are at most `exp(LEEWAY)`.
 const LEEWAY: f32 = 8.0;
@@ -148,7 +147,12 @@ fn zero_sums(#[comptime] count: usize, #[comptime] tile: AttentionTile) -> Seque
 
 /// Writes the scores of the plane's rows and the lines of a stage.
 #[cube]
-fn write_scores(scores: &mut [Four<f32>], rows: &Sequence<Matrix<f16>>, stage: &[Four<f16>], #[comptime] tile: AttentionTile) {
+fn write_scores(
+    scores: &mut [Four<f32>],
+    rows: &Sequence<Matrix<f16>>,
+    stage: &[Four<f16>],
+    #[comptime] tile: AttentionTile,
+) {
     let [m, n, k] = comptime!(tile.shape.sizes);
     let blocks = comptime!(tile.columns / n);
     let sums = zero_sums(blocks, tile);
@@ -174,7 +178,12 @@ fn write_scores(scores: &mut [Four<f32>], rows: &Sequence<Matrix<f16>>, stage: &
 
 /// Adds the products of the plane's weights and the lines of a stage.
 #[cube]
-fn add_products(sums: &Sequence<Matrix<f32>>, weights: &[Four<f16>], stage: &[Four<f16>], #[comptime] tile: AttentionTile) {
+fn add_products(
+    sums: &Sequence<Matrix<f32>>,
+    weights: &[Four<f16>],
+    stage: &[Four<f16>],
+    #[comptime] tile: AttentionTile,
+) {
     let [m, n, k] = comptime!(tile.shape.sizes);
     #[unroll]
     for c in 0..comptime!(tile.columns / k) {
@@ -248,7 +257,12 @@ fn write_sums<V: Size>(
 
 /// Multiplies the rows of the plane's sums by the factor of the unit's row.
 #[cube]
-fn scale_sums(sums: &mut Sequence<Matrix<f32>>, scores: &mut [Four<f32>], factor: f32, #[comptime] tile: AttentionTile) {
+fn scale_sums(
+    sums: &mut Sequence<Matrix<f32>>,
+    scores: &mut [Four<f32>],
+    factor: f32,
+    #[comptime] tile: AttentionTile,
+) {
     let n = comptime!(tile.shape.sizes[1]);
     let pitch = comptime!(tile.pitches()[2]);
     let first = first_row_of_plane(tile) * pitch / 4;
@@ -465,19 +479,6 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
         first += tile.columns;
     }
     write_sums::<V>(grad_query, &sums, &mut scores, scale, &grad_rows, &head, first_row, tile);
-}
-
-/// Reads four values of rows from `first`, 0 at and after the limit.
-#[cube]
-fn read_rows(from: &[f32], start: usize, first: usize, limit: usize) -> Four<f32> {
-    let mut values = Four::<f32>::new(0.0);
-    #[unroll]
-    for i in 0..4usize {
-        if first + i < limit {
-            values.insert(i, from[start + first + i]);
-        }
-    }
-    values
 }
 
 /// Computes the gradients of keys and values: `dV = P^T dO`, `dK = s dS^T Q`.

@@ -9,7 +9,7 @@ use half::f16;
 
 use crate::epilogue::write_four;
 use crate::load::{Four, Lines, load_four};
-use crate::product::{ProductKind, Sizes};
+use crate::product_kind::{ProductKind, Sizes};
 
 /// Values between two lines of a stage beyond those of a line, so that the lines begin in different banks.
 pub(crate) const PAD: usize = 8;
@@ -189,16 +189,68 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     }
 
     let mut term = first_term;
-    fetch_operand::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_lines.stride, first_row, term, sizes.rows, last_term, lhs_inner, m, k, units);
-    fetch_operand::<B, VB>(&mut rhs_next, rhs, rhs_start, rhs_lines.stride, first_column, term, sizes.columns, last_term, rhs_inner, n, k, units);
+    fetch_operand::<A, VA>(
+        &mut lhs_next,
+        lhs,
+        lhs_start,
+        lhs_lines.stride,
+        first_row,
+        term,
+        sizes.rows,
+        last_term,
+        lhs_inner,
+        m,
+        k,
+        units,
+    );
+    fetch_operand::<B, VB>(
+        &mut rhs_next,
+        rhs,
+        rhs_start,
+        rhs_lines.stride,
+        first_column,
+        term,
+        sizes.columns,
+        last_term,
+        rhs_inner,
+        n,
+        k,
+        units,
+    );
     while term < last_term {
         sync_cube();
         put_lines(&mut lhs_stage, &lhs_next, lhs_count, lhs_values, units);
         put_lines(&mut rhs_stage, &rhs_next, rhs_count, rhs_values, units);
         sync_cube();
         term += k;
-        fetch_operand::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_lines.stride, first_row, term, sizes.rows, last_term, lhs_inner, m, k, units);
-        fetch_operand::<B, VB>(&mut rhs_next, rhs, rhs_start, rhs_lines.stride, first_column, term, sizes.columns, last_term, rhs_inner, n, k, units);
+        fetch_operand::<A, VA>(
+            &mut lhs_next,
+            lhs,
+            lhs_start,
+            lhs_lines.stride,
+            first_row,
+            term,
+            sizes.rows,
+            last_term,
+            lhs_inner,
+            m,
+            k,
+            units,
+        );
+        fetch_operand::<B, VB>(
+            &mut rhs_next,
+            rhs,
+            rhs_start,
+            rhs_lines.stride,
+            first_column,
+            term,
+            sizes.columns,
+            last_term,
+            rhs_inner,
+            n,
+            k,
+            units,
+        );
         #[unroll]
         for t in 0..comptime!(k / sk) {
             let mut b = Sequence::<Matrix<f16>>::new();
@@ -206,11 +258,13 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
             for j in 0..columns {
                 let side = plane_column + j * sn;
                 if comptime!(rhs_inner) {
-                    let mut matrix = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, sm, sn, sk, MatrixLayout::ColMajor) };
+                    let mut matrix =
+                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, sm, sn, sk, MatrixLayout::ColMajor) };
                     load_matrix(&mut matrix, &rhs_stage, side, t * sk, rhs_pitch);
                     b.push(matrix);
                 } else {
-                    let mut matrix = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, sm, sn, sk, MatrixLayout::RowMajor) };
+                    let mut matrix =
+                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, sm, sn, sk, MatrixLayout::RowMajor) };
                     load_matrix(&mut matrix, &rhs_stage, t * sk, side, rhs_pitch);
                     b.push(matrix);
                 }
@@ -219,7 +273,8 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
             for i in 0..rows {
                 let side = plane_row + i * sm;
                 if comptime!(lhs_inner) {
-                    let mut a = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, sm, sn, sk, MatrixLayout::RowMajor) };
+                    let mut a =
+                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, sm, sn, sk, MatrixLayout::RowMajor) };
                     load_matrix(&mut a, &lhs_stage, side, t * sk, lhs_pitch);
                     #[unroll]
                     for j in 0..columns {
@@ -227,7 +282,8 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
                         cmma::execute(&a, &b[j], sum, sum);
                     }
                 } else {
-                    let mut a = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, sm, sn, sk, MatrixLayout::ColMajor) };
+                    let mut a =
+                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, sm, sn, sk, MatrixLayout::ColMajor) };
                     load_matrix(&mut a, &lhs_stage, t * sk, side, lhs_pitch);
                     #[unroll]
                     for j in 0..columns {
@@ -247,14 +303,30 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     for i in 0..rows {
         #[unroll]
         for j in 0..columns {
-            cmma::store(&mut scratch[first..first + comptime!(sm * sn / 4)], &sums[i * columns + j], sn as u32, MatrixLayout::RowMajor);
+            cmma::store(
+                &mut scratch[first..first + comptime!(sm * sn / 4)],
+                &sums[i * columns + j],
+                sn as u32,
+                MatrixLayout::RowMajor,
+            );
             sync_cube();
             #[unroll]
             for step in 0..comptime!((sm * sn / 4).div_ceil(plane_units)) {
                 let four = lane + step * plane_units;
                 let row = first_row + plane_row + i * sm + four / (sn / 4);
                 let column = first_column + plane_column + j * sn + four % (sn / 4) * 4;
-                write_four::<O, VO>(output, bias, residual, scratch[first + four], start, row, column, sizes.rows, sizes.columns, comptime!(kind.epilogue));
+                write_four::<O, VO>(
+                    output,
+                    bias,
+                    residual,
+                    scratch[first + four],
+                    start,
+                    row,
+                    column,
+                    sizes.rows,
+                    sizes.columns,
+                    comptime!(kind.epilogue),
+                );
             }
             sync_cube();
         }

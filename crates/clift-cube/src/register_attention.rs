@@ -7,7 +7,7 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::attention::{Head, Rows, head_of_cube};
+use crate::head_rows::{Head, Rows, head_of_cube, read_rows, write_values};
 use crate::load::{Four, load_four};
 use crate::register_product::{fetch, put};
 
@@ -46,8 +46,34 @@ fn add_scores<R: Numeric, C: Numeric, V: Size>(
     let column_start = column_lines.start_of(head);
     for slice in 0..comptime!(width.div_ceil(SLICE)) {
         let term = slice * SLICE;
-        fetch::<R, V>(&mut row_next, rows, row_start, row_lines.stride, first_row, term, row_lines.count, width, true, ROWS, SLICE, UNITS);
-        fetch::<C, V>(&mut column_next, columns, column_start, column_lines.stride, first_column, term, column_lines.count, width, true, COLUMNS, SLICE, UNITS);
+        fetch::<R, V>(
+            &mut row_next,
+            rows,
+            row_start,
+            row_lines.stride,
+            first_row,
+            term,
+            row_lines.count,
+            width,
+            true,
+            ROWS,
+            SLICE,
+            UNITS,
+        );
+        fetch::<C, V>(
+            &mut column_next,
+            columns,
+            column_start,
+            column_lines.stride,
+            first_column,
+            term,
+            column_lines.count,
+            width,
+            true,
+            COLUMNS,
+            SLICE,
+            UNITS,
+        );
         sync_cube();
         put(row_stage, &row_next, true, ROWS, SLICE, UNITS);
         put(column_stage, &column_next, true, COLUMNS, SLICE, UNITS);
@@ -82,7 +108,8 @@ fn stage_lines<C: Numeric, V: Size>(
         if group < COLUMNS * groups {
             let line = group / groups;
             let four = group % groups;
-            stage[line * pitch + four] = load_four::<C, V, f32>(from, start, lines.stride, first + line, four * 4, lines.count, width);
+            stage[line * pitch + four] =
+                load_four::<C, V, f32>(from, start, lines.stride, first + line, four * 4, lines.count, width);
         }
     }
 }
@@ -94,12 +121,7 @@ pub(crate) fn sum_fours(width: usize) -> usize {
 
 /// Adds `sum_c weight_rc line_c` to the unit's sums; the weights are `[COLUMNS][ROWS]`.
 #[cube]
-fn add_lines(
-    sums: &mut Array<Four<f32>>,
-    weights: &[Four<f32>],
-    lines: &[Four<f32>],
-    #[comptime] width: usize,
-) {
+fn add_lines(sums: &mut Array<Four<f32>>, weights: &[Four<f32>], lines: &[Four<f32>], #[comptime] width: usize) {
     let x = UNIT_POS as usize % UNITS_X;
     let y = UNIT_POS as usize / UNITS_X;
     let fours = comptime!(sum_fours(width));
@@ -141,24 +163,6 @@ fn write_sums<V: Size>(
                 let values = sums[i * fours + g] * Four::<f32>::new(factors.extract(i));
                 let index = start + row * lines.stride + column;
                 write_values::<V>(output, values, index, column, width);
-            }
-        }
-    }
-}
-
-/// Writes the values of a vector whose column is below `limit`.
-#[cube]
-pub(crate) fn write_values<V: Size>(output: &mut [Vector<f32, V>], values: Four<f32>, index: usize, column: usize, limit: usize) {
-    let width = V::value().comptime();
-    if comptime!(width == 4) {
-        if column < limit {
-            output[index / 4] = Vector::cast_from(values);
-        }
-    } else {
-        #[unroll]
-        for i in 0..4usize {
-            if column + i < limit {
-                output[index + i] = Vector::cast_from(values.extract(i));
             }
         }
     }
@@ -214,7 +218,19 @@ pub(crate) fn forward<F: Float, V: Size>(
     let mut first = 0usize;
     while first < key_rows.count {
         clear(&mut scores);
-        add_scores::<F, F, V>(&mut scores, query, key, &query_rows, &key_rows, &head, first_row, first, &mut row_stage, &mut column_stage, width);
+        add_scores::<F, F, V>(
+            &mut scores,
+            query,
+            key,
+            &query_rows,
+            &key_rows,
+            &head,
+            first_row,
+            first,
+            &mut row_stage,
+            &mut column_stage,
+            width,
+        );
         let mut largest = maximum;
         #[unroll]
         for j in 0..4usize {
@@ -270,19 +286,6 @@ pub(crate) fn forward<F: Float, V: Size>(
     }
 }
 
-/// Reads the four values of rows at `first`, 0 for rows at and after the limit.
-#[cube]
-fn read_rows(from: &[f32], start: usize, first: usize, limit: usize) -> Four<f32> {
-    let mut values = Four::<f32>::new(0.0);
-    #[unroll]
-    for i in 0..4usize {
-        if first + i < limit {
-            values.insert(i, from[start + first + i]);
-        }
-    }
-    values
-}
-
 /// Computes the gradient of the queries: `dQ = s dS K`, with `dS = P (dO V^T - delta)`.
 #[cube(launch_unchecked)]
 pub(crate) fn backward_by_queries<F: Float, V: Size>(
@@ -324,8 +327,32 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
     while first < key_rows.count {
         clear(&mut scores);
         clear(&mut grads);
-        add_scores::<F, F, V>(&mut scores, query, key, &query_rows, &key_rows, &head, first_row, first, &mut row_stage, &mut column_stage, width);
-        add_scores::<f32, F, V>(&mut grads, grad_output, value, &output_rows, &value_rows, &head, first_row, first, &mut row_stage, &mut column_stage, width);
+        add_scores::<F, F, V>(
+            &mut scores,
+            query,
+            key,
+            &query_rows,
+            &key_rows,
+            &head,
+            first_row,
+            first,
+            &mut row_stage,
+            &mut column_stage,
+            width,
+        );
+        add_scores::<f32, F, V>(
+            &mut grads,
+            grad_output,
+            value,
+            &output_rows,
+            &value_rows,
+            &head,
+            first_row,
+            first,
+            &mut row_stage,
+            &mut column_stage,
+            width,
+        );
         sync_cube();
         stage_lines::<F, V>(&mut lines, key, &key_rows, &head, first, width);
         #[unroll]
@@ -384,8 +411,32 @@ pub(crate) fn backward_by_keys<F: Float, V: Size>(
     while first < query_rows.count {
         clear(&mut scores);
         clear(&mut grads);
-        add_scores::<F, F, V>(&mut scores, key, query, &key_rows, &query_rows, &head, first_row, first, &mut row_stage, &mut column_stage, width);
-        add_scores::<F, f32, V>(&mut grads, value, grad_output, &value_rows, &output_rows, &head, first_row, first, &mut row_stage, &mut column_stage, width);
+        add_scores::<F, F, V>(
+            &mut scores,
+            key,
+            query,
+            &key_rows,
+            &query_rows,
+            &head,
+            first_row,
+            first,
+            &mut row_stage,
+            &mut column_stage,
+            width,
+        );
+        add_scores::<F, f32, V>(
+            &mut grads,
+            value,
+            grad_output,
+            &value_rows,
+            &output_rows,
+            &head,
+            first_row,
+            first,
+            &mut row_stage,
+            &mut column_stage,
+            width,
+        );
         let logs = read_rows(log_sum, start, column_of(first, 0), query_rows.count);
         let deltas = read_rows(delta, start, column_of(first, 0), query_rows.count);
         sync_cube();

@@ -1,12 +1,12 @@
 //! Products on register tiles: every thread sums a tile of the output in registers, from stages in shared memory.
 // M rows, N columns, K terms of a sum; U units (threads) of a cube (workgroup)
 
-use cubecl::prelude::*;
 use cubecl::ir::ElemType;
+use cubecl::prelude::*;
 
 use crate::epilogue::write_four;
 use crate::load::{Four, Lines, load_four};
-use crate::product::{ProductKind, Sizes};
+use crate::product_kind::{ProductKind, Sizes};
 
 /// Tile of a cube and of a unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -159,8 +159,34 @@ pub(crate) fn register_product<A: Float, B: Float, O: Float, VA: Size, VB: Size,
     let mut a = Array::<Four<f32>>::new(comptime!(rows / 4));
     let mut b = Array::<Four<f32>>::new(comptime!(columns / 4));
 
-    fetch::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_lines.stride, first_row, first_term, sizes.rows, last_term, lhs_inner, m, k, units);
-    fetch::<B, VB>(&mut rhs_next, rhs, rhs_start, rhs_lines.stride, first_column, first_term, sizes.columns, last_term, rhs_inner, n, k, units);
+    fetch::<A, VA>(
+        &mut lhs_next,
+        lhs,
+        lhs_start,
+        lhs_lines.stride,
+        first_row,
+        first_term,
+        sizes.rows,
+        last_term,
+        lhs_inner,
+        m,
+        k,
+        units,
+    );
+    fetch::<B, VB>(
+        &mut rhs_next,
+        rhs,
+        rhs_start,
+        rhs_lines.stride,
+        first_column,
+        first_term,
+        sizes.columns,
+        last_term,
+        rhs_inner,
+        n,
+        k,
+        units,
+    );
     let mut term = first_term;
     while term < last_term {
         sync_cube();
@@ -168,8 +194,34 @@ pub(crate) fn register_product<A: Float, B: Float, O: Float, VA: Size, VB: Size,
         put(&mut rhs_stage, &rhs_next, rhs_inner, n, k, units);
         sync_cube();
         term += k;
-        fetch::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_lines.stride, first_row, term, sizes.rows, last_term, lhs_inner, m, k, units);
-        fetch::<B, VB>(&mut rhs_next, rhs, rhs_start, rhs_lines.stride, first_column, term, sizes.columns, last_term, rhs_inner, n, k, units);
+        fetch::<A, VA>(
+            &mut lhs_next,
+            lhs,
+            lhs_start,
+            lhs_lines.stride,
+            first_row,
+            term,
+            sizes.rows,
+            last_term,
+            lhs_inner,
+            m,
+            k,
+            units,
+        );
+        fetch::<B, VB>(
+            &mut rhs_next,
+            rhs,
+            rhs_start,
+            rhs_lines.stride,
+            first_column,
+            term,
+            sizes.columns,
+            last_term,
+            rhs_inner,
+            n,
+            k,
+            units,
+        );
         for t in 0..k {
             #[unroll]
             for i in 0..rows / 4 {
@@ -198,7 +250,18 @@ pub(crate) fn register_product<A: Float, B: Float, O: Float, VA: Size, VB: Size,
         for j in 0..columns / 4 {
             let column = first_column + (x + j * units_x) * 4;
             let sum = sums[i * (columns / 4) + j];
-            write_four::<O, VO>(output, bias, residual, sum, start, row, column, sizes.rows, sizes.columns, comptime!(kind.epilogue));
+            write_four::<O, VO>(
+                output,
+                bias,
+                residual,
+                sum,
+                start,
+                row,
+                column,
+                sizes.rows,
+                sizes.columns,
+                comptime!(kind.epilogue),
+            );
         }
     }
 }

@@ -159,7 +159,8 @@ mod tests {
             let mut expected_gammas = vec![0.0; norm_parts * width];
             for head in 0..rows * parts * num_heads {
                 let part = head / num_heads % parts;
-                let line = |x: &[f32]| -> Vec<f64> { x[head * width..][..width].iter().map(|&x| f64::from(x)).collect() };
+                let line =
+                    |x: &[f32]| -> Vec<f64> { x[head * width..][..width].iter().map(|&x| f64::from(x)).collect() };
                 let (x, grad) = (line(&x), line(&grad));
                 if part >= norm_parts {
                     expected.extend(x);

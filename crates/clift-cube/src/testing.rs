@@ -1,7 +1,7 @@
 //! Devices and tensors of tests.
 
-use cubecl::prelude::*;
 use cubecl::device::{Device, RuntimeId, WgpuDevice};
+use cubecl::prelude::*;
 use cubecl::wgpu::{WgpuServer, WgslCompiler};
 
 use crate::buffer::{Buffer, Matrices, Values};

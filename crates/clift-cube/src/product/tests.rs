@@ -9,7 +9,14 @@ fn gelu(x: f64) -> f64 {
 }
 
 /// Checks a product with every step against f64.
-fn check(client: &Client, tile: ProductTile, sizes: [usize; 3], batch: usize, transposed: [bool; 2], types: [Values; 3]) {
+fn check(
+    client: &Client,
+    tile: ProductTile,
+    sizes: [usize; 3],
+    batch: usize,
+    transposed: [bool; 2],
+    types: [Values; 3],
+) {
     let [m, n, k] = sizes;
     let [lhs_values, rhs_values, output] = types;
     let operands = if matches!(tile, ProductTile::Matrix(_)) { Values::F16 } else { Values::F32 };
@@ -99,7 +106,8 @@ fn matrix_tiles_equal_f64_of_rounded_operands() {
 #[test]
 fn products_are_equal_at_every_run() {
     let client = client();
-    let (lhs, rhs) = (upload(&client, &random(70 * 600, 1), Values::F32), upload(&client, &random(600 * 33, 2), Values::F32));
+    let (lhs, rhs) =
+        (upload(&client, &random(70 * 600, 1), Values::F32), upload(&client, &random(600 * 33, 2), Values::F32));
     let mut product = Product::new(matrices(&lhs, 600), matrices(&rhs, 33), [70, 33, 600]);
     for operands in [Values::F32, Values::F16] {
         product.operands = operands;
