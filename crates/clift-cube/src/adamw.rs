@@ -38,7 +38,7 @@ fn update<V: Size>(
     factor: &[f32],
     rates: AdamW,
 ) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < grad.len() {
         let grad = grad[index] * Vector::<f32, V>::new(factor[0]);
         let old = Vector::<f32, V>::new(rates.beta_1);

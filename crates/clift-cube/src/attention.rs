@@ -231,7 +231,7 @@ fn delta_kernel(
     num_heads: usize,
     #[comptime] width: usize,
 ) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < delta.len() {
         // The heads of a row lie side by side.
         let row = index / num_heads;
@@ -253,29 +253,28 @@ mod tests {
     fn reference(q: &[f64], k: &[f64], v: &[f64], grad: &[f64], width: usize) -> [Vec<f64>; 5] {
         let (nq, nk) = (q.len() / width, k.len() / width);
         let scale = 1.0 / (width as f64).sqrt();
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let line = |x: &[f64], i: usize| x[i * width..(i + 1) * width].to_vec();
+        let dot = |a: &[f64], i: usize, b: &[f64], j: usize| -> f64 {
+            a[i * width..][..width].iter().zip(&b[j * width..][..width]).map(|(a, b)| a * b).sum()
+        };
+        let add = |to: &mut [f64], i: usize, factor: f64, from: &[f64], j: usize| {
+            let pairs = to[i * width..][..width].iter_mut().zip(&from[j * width..][..width]);
+            pairs.for_each(|(to, from)| *to += factor * from);
+        };
         let [mut out, mut dq] = [vec![0.0; q.len()], vec![0.0; q.len()]];
         let [mut dk, mut dv] = [vec![0.0; k.len()], vec![0.0; k.len()]];
         let mut logs = vec![0.0; nq];
         for i in 0..nq {
-            let scores: Vec<f64> = (0..nk).map(|j| scale * dot(&line(q, i), &line(k, j))).collect();
+            let scores: Vec<f64> = (0..nk).map(|j| scale * dot(q, i, k, j)).collect();
             let largest = scores.iter().copied().fold(f64::MIN, f64::max);
             logs[i] = largest + scores.iter().map(|s| (s - largest).exp()).sum::<f64>().ln();
             let weights: Vec<f64> = scores.iter().map(|s| (s - logs[i]).exp()).collect();
+            (0..nk).for_each(|j| add(&mut out, i, weights[j], v, j));
+            let delta = dot(grad, i, &out, i);
             for j in 0..nk {
-                for e in 0..width {
-                    out[i * width + e] += weights[j] * v[j * width + e];
-                }
-            }
-            let delta = dot(&line(grad, i), &line(&out, i));
-            for j in 0..nk {
-                let slope = scale * weights[j] * (dot(&line(grad, i), &line(v, j)) - delta);
-                for e in 0..width {
-                    dv[j * width + e] += weights[j] * grad[i * width + e];
-                    dq[i * width + e] += slope * k[j * width + e];
-                    dk[j * width + e] += slope * q[i * width + e];
-                }
+                let slope = scale * weights[j] * (dot(grad, i, v, j) - delta);
+                add(&mut dv, j, weights[j], grad, i);
+                add(&mut dq, i, slope, k, j);
+                add(&mut dk, j, slope, q, i);
             }
         }
         [out, logs, dq, dk, dv]
@@ -346,7 +345,15 @@ mod tests {
 
     #[test]
     fn attention_in_f32_equals_f64() {
-        let sizes = [[1, 1, 2, 12], [70, 33, 1, 96], [65, 130, 2, 24], [7, 64, 1, 128], [5, 9, 2, 18]];
+        let sizes = [
+            [1, 1, 2, 12],
+            [70, 33, 1, 96],
+            [65, 130, 2, 24],
+            [7, 64, 1, 128],
+            [5, 9, 2, 18],
+            [4097, 300, 1, 12],
+            [31, 4097, 1, 40],
+        ];
         check_all(&sizes, Values::F32, 1e-5);
     }
 

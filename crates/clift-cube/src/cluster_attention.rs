@@ -43,7 +43,7 @@ struct Groups {
 /// Sorts the members of a scene by segment, by counting those before them.
 #[cube(launch_unchecked)]
 fn group(segment: &[i32], order: &mut [u32], first: &mut [u32], batch: usize, num_segments: usize, num_members: usize) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     let units = num_members + num_segments;
     if index < batch * units {
         let scene = index / units;
@@ -129,7 +129,7 @@ fn forward<V: Size>(
     scale: f32,
     #[comptime] width: usize,
 ) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < batch * num_segments * num_heads {
         let segment = index / num_heads;
         let head = index % num_heads;
@@ -167,7 +167,7 @@ fn forward<V: Size>(
         let factor = 1.0 / max(total, f32::new(1.0));
         for i in begin..end {
             let at = order[i] as usize * num_heads + head;
-            weights[at] = weights[at] * factor;
+            weights[at] *= factor;
         }
         #[unroll]
         for e in 0..vectors {
@@ -194,7 +194,7 @@ fn backward<V: Size>(
     scale: f32,
     #[comptime] width: usize,
 ) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < batch * num_segments * num_heads {
         let segment = index / num_heads;
         let head = index % num_heads;

@@ -16,7 +16,7 @@ fn exponential(x: f32) -> f32 {
 #[cube]
 fn normal(x: f32, exponential: f32) -> f32 {
     // 0.3275911 / sqrt(2)
-    let t = 1.0f32 / (1.0f32 + 0.231_641_89f32 * x.abs());
+    let t = 1.0f32 / (1.0f32 + 0.231_641_9f32 * x.abs());
     let mut sum = fma(t, 1.061_405_4f32, -1.453_152f32);
     sum = fma(t, sum, 1.421_413_7f32);
     sum = fma(t, sum, -0.284_496_74f32);
@@ -35,7 +35,7 @@ pub(crate) fn gelu(x: f32) -> f32 {
 #[cube]
 pub(crate) fn gelu_slope(x: f32) -> f32 {
     let exponential = exponential(x);
-    normal(x, exponential) + x * 0.398_942_28f32 * exponential
+    normal(x, exponential) + x * 0.398_942_3f32 * exponential
 }
 
 const UNITS: usize = 256;
@@ -46,7 +46,7 @@ fn forward<X: Float, O: Float, V: Size>(
     output: &mut [Vector<O, V>],
     #[define(X, O)] _types: [ElemType; 2],
 ) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < x.len() {
         let mut values = Vector::<f32, V>::cast_from(x[index]);
         #[unroll]
@@ -64,7 +64,7 @@ fn backward<X: Float, V: Size>(
     grad_x: &mut [Vector<f32, V>],
     #[define(X)] _types: ElemType,
 ) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < x.len() {
         let mut values = Vector::<f32, V>::cast_from(x[index]);
         #[unroll]

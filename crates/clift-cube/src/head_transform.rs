@@ -34,7 +34,7 @@ fn transform(
     negative: usize,
 ) {
     let eighth = width / 8;
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < x.len() / 8 {
         let head = index / eighth;
         let k = index % eighth;

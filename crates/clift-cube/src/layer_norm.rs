@@ -21,7 +21,7 @@ fn forward<O: Float, V: Size>(
     rows: usize,
     columns: usize,
     epsilon: f32,
-    #[define(O)] _output: ElemType,
+    #[define(O)] _values: ElemType,
 ) {
     let mut stage = Shared::<[f32]>::new_slice(ROWS * LANES);
     let vectors = columns / V::value().comptime();

@@ -1,5 +1,14 @@
-//! GPU kernels of clift, in CubeCL: buffers in, buffers out.
+//! GPU kernels of clift, in `CubeCL`: buffers in, buffers out.
 #![cfg(feature = "wgpu")]
+#![expect(
+    clippy::collapsible_if,
+    clippy::manual_is_multiple_of,
+    clippy::needless_range_loop,
+    clippy::too_many_lines,
+    clippy::trivially_copy_pass_by_ref,
+    clippy::used_underscore_binding,
+    reason = "kernels are written in the part of Rust that CubeCL translates"
+)]
 
 mod adamw;
 mod adapter;

@@ -12,7 +12,7 @@ use half::f16;
 
 use crate::head_rows::{Head, Rows, head_of_cube, read_rows, write_values};
 use crate::load::{Four, load_four};
-use crate::matrix_product::{MatrixShape, PAD, load_matrix};
+use crate::matrix_product::{MatrixShape, PAD, StagedMatrix, load_matrix};
 
 /// How far scores may exceed the maximum by which weights are divided: weights are at most `exp(LEEWAY)`.
 const LEEWAY: f32 = 8.0;
@@ -57,6 +57,18 @@ impl AttentionTile {
     /// Values between two lines of a stage, rows of weights, and rows of scores.
     fn pitches(self) -> [usize; 3] {
         [self.padded() + PAD, self.columns + PAD, self.columns + 4]
+    }
+
+    /// Rows, lines as the right operand of scores, weights, and lines as the right operand of sums.
+    fn staged(self) -> [StagedMatrix; 4] {
+        let [lines, weights, _] = self.pitches();
+        let staged = |ident, terms_inner, pitch| StagedMatrix { ident, terms_inner, pitch, shape: self.shape };
+        [
+            staged(MatrixIdent::A, true, lines),
+            staged(MatrixIdent::B, true, lines),
+            staged(MatrixIdent::A, true, weights),
+            staged(MatrixIdent::B, false, lines),
+        ]
     }
 
     /// Matrices of a row along its terms, and along its values.
@@ -153,15 +165,14 @@ fn write_scores(
     stage: &[Four<f16>],
     #[comptime] tile: AttentionTile,
 ) {
-    let [m, n, k] = comptime!(tile.shape.sizes);
+    let [_, n, k] = comptime!(tile.shape.sizes);
     let blocks = comptime!(tile.columns / n);
     let sums = zero_sums(blocks, tile);
     #[unroll]
     for e in 0..comptime!(tile.matrices()[0]) {
         #[unroll]
         for j in 0..blocks {
-            let mut b = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, m, n, k, MatrixLayout::ColMajor) };
-            load_matrix(&mut b, stage, j * n, e * k, comptime!(tile.pitches()[0]));
+            let b = load_matrix(stage, j * n, e * k, comptime!(tile.staged()[1]));
             cmma::execute(rows.index(e), &b, sums.index(j), sums.index(j));
         }
     }
@@ -184,15 +195,13 @@ fn add_products(
     stage: &[Four<f16>],
     #[comptime] tile: AttentionTile,
 ) {
-    let [m, n, k] = comptime!(tile.shape.sizes);
+    let [_, n, k] = comptime!(tile.shape.sizes);
     #[unroll]
     for c in 0..comptime!(tile.columns / k) {
-        let mut a = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, m, n, k, MatrixLayout::RowMajor) };
-        load_matrix(&mut a, weights, first_row_of_plane(tile), c * k, comptime!(tile.pitches()[1]));
+        let a = load_matrix(weights, first_row_of_plane(tile), c * k, comptime!(tile.staged()[2]));
         #[unroll]
         for j in 0..comptime!(tile.matrices()[1]) {
-            let mut b = unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, m, n, k, MatrixLayout::RowMajor) };
-            load_matrix(&mut b, stage, c * k, j * n, comptime!(tile.pitches()[0]));
+            let b = load_matrix(stage, j * n, c * k, comptime!(tile.staged()[3]));
             cmma::execute(&a, &b, sums.index(j), sums.index(j));
         }
     }
@@ -275,7 +284,7 @@ fn scale_sums(
         #[unroll]
         for i in 0..comptime!(n / 4 / tile.lanes()) {
             let index = (row_of_unit(tile) * pitch + column_of_unit(i, tile)) / 4;
-            scores[index] = scores[index] * Four::<f32>::new(factor);
+            scores[index] *= Four::<f32>::new(factor);
         }
         sync_plane();
         cmma::load_with_layout(sums.index_mut(j), &scores[first..len], pitch as u32, MatrixLayout::RowMajor);

@@ -117,17 +117,39 @@ pub(crate) fn put_lines(
     }
 }
 
-/// Loads a matrix of a stage whose lines have `pitch` values; `line` and `value` are its first.
+/// Operand of a product of matrices, and how it lies in a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct StagedMatrix {
+    pub(crate) ident: MatrixIdent,
+    /// Whether a line has the terms of a sum.
+    pub(crate) terms_inner: bool,
+    /// Values between two lines.
+    pub(crate) pitch: usize,
+    pub(crate) shape: MatrixShape,
+}
+
+impl StagedMatrix {
+    fn layout(self) -> MatrixLayout {
+        let is_lhs = self.ident == MatrixIdent::A;
+        if is_lhs == self.terms_inner { MatrixLayout::RowMajor } else { MatrixLayout::ColMajor }
+    }
+}
+
+/// Loads the matrix of a stage whose first value belongs to row or column `side` and to `term`.
 #[cube]
 pub(crate) fn load_matrix(
-    matrix: &mut Matrix<f16>,
     stage: &[Four<f16>],
-    line: usize,
-    value: usize,
-    #[comptime] pitch: usize,
-) {
-    let first = (line * pitch + value) / 4;
-    cmma::load(matrix, &stage[first..stage.len()], comptime!(pitch as u32));
+    side: usize,
+    term: usize,
+    #[comptime] staged: StagedMatrix,
+) -> Matrix<f16> {
+    let [m, n, k] = comptime!(staged.shape.sizes);
+    // SAFETY: the matrix is loaded below.
+    let mut matrix =
+        unsafe { Matrix::<f16>::uninitialized(comptime!(staged.ident), m, n, k, comptime!(staged.layout())) };
+    let first = if comptime!(staged.terms_inner) { side * staged.pitch + term } else { term * staged.pitch + side };
+    cmma::load(&mut matrix, &stage[first / 4..stage.len()], comptime!(staged.pitch as u32));
+    matrix
 }
 
 /// Computes `output = epilogue(lhs rhs)`. A cube computes a tile of a batch and of a split of the terms.
@@ -174,6 +196,10 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     let rhs_pitch = comptime!(rhs_values + PAD);
     let mut lhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(lhs_count * lhs_pitch / 4));
     let mut rhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(rhs_count * rhs_pitch / 4));
+    let lhs_staged =
+        comptime!(StagedMatrix { ident: MatrixIdent::A, terms_inner: lhs_inner, pitch: lhs_pitch, shape: tile.shape });
+    let rhs_staged =
+        comptime!(StagedMatrix { ident: MatrixIdent::B, terms_inner: rhs_inner, pitch: rhs_pitch, shape: tile.shape });
     let mut lhs_next = Array::<Four<f16>>::new(comptime!((m * k / 4).div_ceil(units)));
     let mut rhs_next = Array::<Four<f16>>::new(comptime!((n * k / 4).div_ceil(units)));
 
@@ -256,40 +282,15 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
             let mut b = Sequence::<Matrix<f16>>::new();
             #[unroll]
             for j in 0..columns {
-                let side = plane_column + j * sn;
-                if comptime!(rhs_inner) {
-                    let mut matrix =
-                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, sm, sn, sk, MatrixLayout::ColMajor) };
-                    load_matrix(&mut matrix, &rhs_stage, side, t * sk, rhs_pitch);
-                    b.push(matrix);
-                } else {
-                    let mut matrix =
-                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::B, sm, sn, sk, MatrixLayout::RowMajor) };
-                    load_matrix(&mut matrix, &rhs_stage, t * sk, side, rhs_pitch);
-                    b.push(matrix);
-                }
+                b.push(load_matrix(&rhs_stage, plane_column + j * sn, t * sk, rhs_staged));
             }
             #[unroll]
             for i in 0..rows {
-                let side = plane_row + i * sm;
-                if comptime!(lhs_inner) {
-                    let mut a =
-                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, sm, sn, sk, MatrixLayout::RowMajor) };
-                    load_matrix(&mut a, &lhs_stage, side, t * sk, lhs_pitch);
-                    #[unroll]
-                    for j in 0..columns {
-                        let sum = &sums[i * columns + j];
-                        cmma::execute(&a, &b[j], sum, sum);
-                    }
-                } else {
-                    let mut a =
-                        unsafe { Matrix::<f16>::uninitialized(MatrixIdent::A, sm, sn, sk, MatrixLayout::ColMajor) };
-                    load_matrix(&mut a, &lhs_stage, t * sk, side, lhs_pitch);
-                    #[unroll]
-                    for j in 0..columns {
-                        let sum = &sums[i * columns + j];
-                        cmma::execute(&a, &b[j], sum, sum);
-                    }
+                let a = load_matrix(&lhs_stage, plane_row + i * sm, t * sk, lhs_staged);
+                #[unroll]
+                for j in 0..columns {
+                    let sum = &sums[i * columns + j];
+                    cmma::execute(&a, &b[j], sum, sum);
                 }
             }
         }

@@ -163,7 +163,7 @@ fn add_splits<O: Float, V: Size>(
     columns: usize,
     splits: usize,
     #[comptime] epilogue: Epilogue,
-    #[define(O)] _output: ElemType,
+    #[define(O)] _values: ElemType,
 ) {
     let width = V::value().comptime();
     let row = CUBE_POS_Y as usize;

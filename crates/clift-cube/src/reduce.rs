@@ -96,7 +96,7 @@ fn sum_chunks<V: Size>(
 /// Sums over the first and the third dimension: `[chunks, parts, repeats, width] -> [parts, width]`.
 #[cube(launch_unchecked)]
 fn sum_partial(partial: &[f32], sums: &mut [f32], chunks: usize, repeats: usize, width: usize) {
-    let index = ABSOLUTE_POS as usize;
+    let index = ABSOLUTE_POS;
     if index < sums.len() {
         let chunk = sums.len() * repeats;
         let first = index / width * repeats * width + index % width;
