@@ -134,8 +134,8 @@ pub fn layer_norm_forward(
     [output, statistics]
 }
 
-/// Computes the gradient of `x`, and those of gamma and beta, one after the other.
-pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3], grad: &Buffer) -> [Buffer; 2] {
+/// Computes the gradients of `x`, gamma and beta.
+pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3], grad: &Buffer) -> [Buffer; 3] {
     let columns = gamma.len;
     let rows = x.len / columns;
     let vector = vector(columns);
@@ -157,7 +157,9 @@ pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3]
         );
     }
     let sizes = RowSizes { rows, columns, stride: columns };
-    [grad_x, sum_over_rows(client, sizes, grad, [x, statistics], Term::Normal, [1, 2 * columns])]
+    let mut sums = sum_over_rows(client, sizes, grad, [x, statistics], Term::Normal, [1, columns]);
+    let grad_beta = sums.remove(1);
+    [grad_x, sums.remove(0), grad_beta]
 }
 
 #[cfg(test)]
@@ -174,7 +176,7 @@ mod tests {
                 .map(|(len, seed)| random(len, seed));
             let [x_, gamma_, beta_, grad_] = [&x, &gamma, &beta, &grad].map(|x| upload(&client, x, Values::F32));
             let [output, statistics] = layer_norm_forward(&client, [&x_, &gamma_, &beta_], 1e-5, Values::F32);
-            let [grad_x, sums] = layer_norm_backward(&client, [&x_, &gamma_, &statistics], &grad_);
+            let [grad_x, grad_gamma, grad_beta] = layer_norm_backward(&client, [&x_, &gamma_, &statistics], &grad_);
 
             let [mut expected, mut expected_x] = [Vec::new(), Vec::new()];
             let mut expected_sums = vec![0.0; 2 * columns];
@@ -198,7 +200,8 @@ mod tests {
             }
             assert!(worst(&read(&client, &output), &expected) < 3e-6);
             assert!(worst(&read(&client, &grad_x), &expected_x) < 3e-6);
-            assert!(worst(&read(&client, &sums), &expected_sums) < 3e-6);
+            assert!(worst(&read(&client, &grad_gamma), &expected_sums[..columns]) < 3e-6);
+            assert!(worst(&read(&client, &grad_beta), &expected_sums[columns..]) < 3e-6);
             assert!(worst(&read(&client, &sum_rows(&client, &grad_, columns)), &expected_sums[columns..]) < 3e-6);
             let [output, _] = layer_norm_forward(&client, [&x_, &gamma_, &beta_], 1e-5, Values::F16);
             assert!(worst(&read(&client, &output), &expected) < 6e-4);

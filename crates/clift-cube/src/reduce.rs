@@ -93,17 +93,25 @@ fn sum_chunks<V: Size>(
     }
 }
 
-/// Sums over the first and the third dimension: `[chunks, parts, repeats, width] -> [parts, width]`.
+/// Sums over the first and the third dimension: `[chunks, parts, repeats, width] -> [parts, width]`. The chunks are `stride`
+/// values apart.
 #[cube(launch_unchecked)]
-fn sum_partial(partial: &[f32], sums: &mut [f32], chunks: usize, repeats: usize, width: usize) {
+fn sum_partial(
+    partial: &[f32],
+    sums: &mut [f32],
+    start: usize,
+    stride: usize,
+    chunks: usize,
+    repeats: usize,
+    width: usize,
+) {
     let index = ABSOLUTE_POS;
     if index < sums.len() {
-        let chunk = sums.len() * repeats;
-        let first = index / width * repeats * width + index % width;
+        let first = start + index / width * repeats * width + index % width;
         let mut sum = 0.0f32;
         for i in 0..chunks {
             for j in 0..repeats {
-                sum += partial[i * chunk + first + j * width];
+                sum += partial[i * stride + first + j * width];
             }
         }
         sums[index] = sum;
@@ -118,7 +126,7 @@ pub(crate) struct RowSizes {
     pub(crate) stride: usize,
 }
 
-/// Sums over rows, then over `repeats` groups of `width` columns.
+/// Sums over rows, then over `repeats` groups of `width` columns; with [`Term::Normal`] the plain sums are the second result.
 pub(crate) fn sum_over_rows(
     client: &Client,
     sizes: RowSizes,
@@ -126,14 +134,13 @@ pub(crate) fn sum_over_rows(
     [x, statistics]: [&Buffer; 2],
     term: Term,
     [repeats, width]: [usize; 2],
-) -> Buffer {
+) -> Vec<Buffer> {
     let RowSizes { rows, columns, stride } = sizes;
     let chunks = rows.div_ceil(CHUNK);
-    let sums = if term == Term::Normal { 2 * columns } else { columns };
-    let partial = Buffer::empty(client, chunks * sums, Values::F32);
+    let num_sums = if term == Term::Normal { 2 } else { 1 };
+    let partial = Buffer::empty(client, chunks * num_sums * columns, Values::F32);
     let aligned = [columns, stride, width].iter().all(|x| x.is_multiple_of(4));
     let vector = if aligned { 4 } else { 1 };
-    let output = Buffer::empty(client, sums / repeats, Values::F32);
     // SAFETY: the kernels compare their indices with the sizes.
     unsafe {
         sum_chunks::launch_unchecked(
@@ -150,22 +157,31 @@ pub(crate) fn sum_over_rows(
             stride,
             term,
         );
-        sum_partial::launch_unchecked(
-            client,
-            CubeCount::Static((sums / repeats).div_ceil(UNITS) as u32, 1, 1),
-            CubeDim::new_1d(UNITS as u32),
-            partial.arg(1),
-            output.arg(1),
-            chunks,
-            repeats,
-            width,
-        );
     }
-    output
+    let sum = |i: usize| {
+        let sums = Buffer::empty(client, columns / repeats, Values::F32);
+        // SAFETY: as above.
+        unsafe {
+            sum_partial::launch_unchecked(
+                client,
+                CubeCount::Static((columns / repeats).div_ceil(UNITS) as u32, 1, 1),
+                CubeDim::new_1d(UNITS as u32),
+                partial.arg(1),
+                sums.arg(1),
+                i * columns,
+                num_sums * columns,
+                chunks,
+                repeats,
+                width,
+            );
+        }
+        sums
+    };
+    (0..num_sums).map(sum).collect()
 }
 
 /// Sums over the rows of `x: [rows, columns]`, the gradient of a bias.
 pub fn sum_rows(client: &Client, x: &Buffer, columns: usize) -> Buffer {
     let sizes = RowSizes { rows: x.len / columns, columns, stride: columns };
-    sum_over_rows(client, sizes, x, [x, x], Term::Plain, [1, columns])
+    sum_over_rows(client, sizes, x, [x, x], Term::Plain, [1, columns]).remove(0)
 }

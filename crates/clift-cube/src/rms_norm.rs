@@ -134,8 +134,8 @@ pub fn rms_norm_backward(client: &Client, [x, gammas]: [&Buffer; 2], grad: &Buff
     let stride = num_parts * num_heads * head_width;
     let sizes = RowSizes { rows: x.len / stride, columns: gammas.len * num_heads, stride };
     let term = Term::Head { width: head_width };
-    let grad_gammas = sum_over_rows(client, sizes, grad, [x, &inverses], term, [num_heads, head_width]);
-    [grad_x, grad_gammas]
+    let mut sums = sum_over_rows(client, sizes, grad, [x, &inverses], term, [num_heads, head_width]);
+    [grad_x, sums.remove(0)]
 }
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! GPUs through `CubeCL`, by the kernels of `clift-cube` in f32 and, on adapters with cooperative matrices, f16.
 
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Cube, TensorMetadata};
-use burn::tensor::{DType, Shape};
+use burn::backend::{Cube, TensorMetadata};
+use burn::tensor::DType;
 use clift_cube as native;
 use clift_cube::{AttentionInputs, AttentionResults, AttentionSizes, Buffer, ClusterSizes, NormHeads, PartTransform};
 use clift_cube::{Product, Values};
@@ -26,7 +26,7 @@ impl Kernels for Cube {
         let last = lhs_shape.num_dims() - 1;
         let is_same_batch = rhs_shape.num_dims() == last + 1 && (0..last - 1).all(|i| lhs_shape[i] == rhs_shape[i]);
         if !is_native(&lhs) || !is_native(&rhs) || !is_same_batch {
-            return Self::float_matmul(lhs, rhs);
+            return primitives::matmul::<Self>(lhs, rhs);
         }
         let mut shape = lhs_shape.clone();
         shape[last] = rhs_shape[last];
@@ -46,7 +46,7 @@ impl Kernels for Cube {
         let [batch, count, width] = x.shape().dims();
         let [_, outputs] = weight.shape().dims();
         let like = x.clone();
-        let x = Self::float_reshape(x, Shape::new([batch * count, width]));
+        let x = primitives::rows::<Self>(x);
         let ([x, weight], bias) = ([x, weight].map(MatrixBuffer::new), buffer(bias));
         let sizes = [batch * count, outputs, width];
         let product = Product::new(x.view(), weight.view(), sizes);
@@ -99,12 +99,11 @@ impl Kernels for Cube {
             return norms::layer_norm_backward::<Self>(norm, grad);
         };
         let like = norm.x.clone();
-        let [_, _, dim] = like.shape().dims();
+        let dim = norm.gamma.shape();
         let inputs = [norm.x, norm.gamma, statistics].map(buffer);
-        let [grad_x, sums] = native::layer_norm_backward(&like.client, inputs.each_ref(), &buffer(grad));
-        let sums = tensor(&like, sums, [2, dim]);
-        let sum = |i: usize| Self::float_reshape(primitives::narrow::<Self>(&sums, 0, i..i + 1), Shape::new([dim]));
-        [tensor(&like, grad_x, like.shape()), sum(0), sum(1)]
+        let grads = native::layer_norm_backward(&like.client, inputs.each_ref(), &buffer(grad));
+        let [grad_x, grad_gamma, grad_beta] = grads;
+        [tensor(&like, grad_x, like.shape()), tensor(&like, grad_gamma, dim.clone()), tensor(&like, grad_beta, dim)]
     }
 
     fn rms_norm_forward([x, gammas]: [FloatTensor<Self>; 2], rows: HeadRows) -> FloatTensor<Self> {
