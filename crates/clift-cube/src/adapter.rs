@@ -63,8 +63,10 @@ impl AdapterClass {
 
 /// Tile of a product.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum ProductTile {
+pub enum ProductTile {
+    /// Sums in registers, in f32.
     Register(RegisterTile),
+    /// Cooperative matrices, of operands in f16.
     Matrix(MatrixTile),
 }
 

@@ -33,7 +33,7 @@ mod rms_norm;
 mod testing;
 
 pub use adamw::{AdamW, adamw, gradient_norm};
-pub use adapter::AdapterClass;
+pub use adapter::{AdapterClass, ProductTile};
 pub use attention::{
     AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward, attention_forward,
 };
@@ -42,6 +42,8 @@ pub use cluster_attention::{ClusterSizes, cluster_attention_backward, cluster_at
 pub use gelu::{gelu_backward, gelu_forward};
 pub use head_transform::{PartTransform, transform_heads};
 pub use layer_norm::{layer_norm_backward, layer_norm_forward};
+pub use matrix_product::{MatrixShape, MatrixTile};
 pub use product::Product;
 pub use reduce::sum_rows;
+pub use register_product::RegisterTile;
 pub use rms_norm::{NormHeads, rms_norm_backward, rms_norm_forward};

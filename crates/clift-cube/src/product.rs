@@ -52,7 +52,8 @@ impl<'a> Product<'a> {
         self.run_tile(client, AdapterClass::of(client).product_tile(self.operands, self.sizes))
     }
 
-    pub(crate) fn run_tile(&self, client: &Client, tile: ProductTile) -> Buffer {
+    /// Computes the product with a tile, which decides the type of the operands.
+    pub fn run_tile(&self, client: &Client, tile: ProductTile) -> Buffer {
         let [m, n, _] = self.sizes;
         let output = Buffer::empty(client, self.batch * m * n, self.output);
         if output.len == 0 {
