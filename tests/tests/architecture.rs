@@ -18,7 +18,7 @@ const CRATES: [Crate; 11] = [
     (
         "clift-cube",
         "",
-        "buffer load gelu epilogue reduce adamw cluster_attention head_rows head_transform layer_norm rms_norm product_kind register_product \
+        "buffer load elementwise gelu epilogue reduce adamw cluster_attention head_rows head_transform layer_norm rms_norm product_kind register_product \
          matrix_product register_attention matrix_attention adapter product attention",
     ),
     (

@@ -5,11 +5,13 @@
 use std::time::{Duration, Instant};
 
 use clift_cube::{
-    AdapterClass, AttentionInputs, AttentionResults, AttentionSizes, Buffer, HeadRows, Matrices, MatrixTile, Product,
-    ProductTile, RegisterTile, Values, attention_backward, attention_forward,
+    AdapterClass, AttentionInputs, AttentionResults, AttentionSizes, AttentionTile, Buffer, HeadRows, Matrices,
+    MatrixTile, Product, ProductTile, RegisterTile, Values, attention_backward_tile, attention_forward_tile,
 };
 use cubecl::Device;
 use cubecl::prelude::Client;
+
+const HEAD_WIDTH: usize = 96;
 
 fn main() {
     let divisor: usize = std::env::args().nth(1).map_or(1, |text| text.parse().expect("the divisor of the sizes"));
@@ -32,8 +34,13 @@ fn main() {
             }
         }
     }
-    for operands in [Values::F32, Values::F16] {
-        time_attention(&client, 4096 / divisor, operands);
+    let count = 4096 / divisor;
+    time_attention(&client, count, None);
+    if let AdapterClass::Matrices(shape) = class {
+        for (planes, columns) in [(8, 2), (4, 2), (4, 4), (2, 2)] {
+            let columns = columns * shape.sizes[0];
+            time_attention(&client, count, Some(AttentionTile { shape, planes, columns, width: HEAD_WIDTH }));
+        }
     }
 }
 
@@ -109,18 +116,19 @@ fn time_product(client: &Client, name: &str, sizes: [usize; 3], transposed: [boo
     );
 }
 
-fn time_attention(client: &Client, count: usize, operands: Values) {
-    let (batch, num_heads, head_width) = (4, 8, 96);
+fn time_attention(client: &Client, count: usize, tile: Option<AttentionTile>) {
+    let (batch, num_heads, head_width) = (4, 8, HEAD_WIDTH);
+    let operands = if tile.is_some() { Values::F16 } else { Values::F32 };
     let sizes = AttentionSizes { batch, num_heads, num_queries: count, num_keys: count, head_width, operands };
     let dim = num_heads * head_width;
     let packed = upload(client, batch * count * 3 * dim, Values::F32);
     let columns = |part| HeadRows { buffer: &packed, column: part * dim, stride: 3 * dim };
     let inputs = AttentionInputs { query: columns(0), key: columns(1), value: columns(2) };
-    let [first, again] = time(client, || attention_forward(client, sizes, &inputs).into());
+    let [first, again] = time(client, || attention_forward_tile(client, sizes, &inputs, tile).into());
     let work = 4e-12 * (batch * count * count * dim) as f64;
     let line = |name: &str, work: f64, [first, again]: [Duration; 2]| {
         println!(
-            "{{\"attention\":\"{name}\",\"operands\":\"{operands:?}\",\"tokens\":{count},\"first_ms\":{:.1},\"ms\":{:.3},\
+            "{{\"attention\":\"{name}\",\"tile\":\"{tile:?}\",\"tokens\":{count},\"first_ms\":{:.1},\"ms\":{:.3},\
              \"tflops\":{:.2}}}",
             1e3 * first.as_secs_f64(),
             1e3 * again.as_secs_f64(),
@@ -128,13 +136,13 @@ fn time_attention(client: &Client, count: usize, operands: Values) {
         );
     };
     line("forward", work, [first, again]);
-    let [output, log_sum] = attention_forward(client, sizes, &inputs);
+    let [output, log_sum] = attention_forward_tile(client, sizes, &inputs, tile);
     let results = AttentionResults { output: &output, log_sum: &log_sum, grad_output: &output };
     let times = time(client, || {
         let grad = Buffer::empty(client, packed.len, Values::F32);
         let columns = |part| HeadRows { buffer: &grad, column: part * dim, stride: 3 * dim };
         let grads = AttentionInputs { query: columns(0), key: columns(1), value: columns(2) };
-        attention_backward(client, sizes, &inputs, results, &grads);
+        attention_backward_tile(client, sizes, &inputs, results, &grads, tile);
         vec![grad]
     });
     line("backward", 2.5 * work, times);

@@ -3,10 +3,9 @@
 use cubecl::prelude::*;
 
 use crate::buffer::{Buffer, Values};
-use crate::gelu::elementwise;
+use crate::elementwise::{UNITS, elementwise};
 use crate::reduce::{sum_of_row, sum_of_vector};
 
-const UNITS: usize = 256;
 /// Vectors that a unit adds.
 const VECTORS: usize = 16;
 

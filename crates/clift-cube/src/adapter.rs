@@ -53,11 +53,11 @@ impl AdapterClass {
         }
     }
 
-    /// Returns the tile of attention with operands of a type; `None` for register tiles, which have one.
-    pub(crate) fn attention_tile(self, operands: Values, width: usize) -> Option<AttentionTile> {
-        let Self::Matrices(shape) = self else { return None };
-        let columns = if shape.sizes[0] == 16 { 32 } else { 16 };
-        (operands == Values::F16).then_some(AttentionTile { shape, planes: 4, columns, width })
+    /// Returns the tiles of attention, forward and backward, with operands of a type; `None` for register tiles, which have one.
+    pub(crate) fn attention_tiles(self, operands: Values, width: usize) -> [Option<AttentionTile>; 2] {
+        let Self::Matrices(shape) = self else { return [None; 2] };
+        let (planes, columns) = if shape.sizes[0] == 16 { ([8, 4], 32) } else { ([4, 4], 16) };
+        planes.map(|planes| (operands == Values::F16).then_some(AttentionTile { shape, planes, columns, width }))
     }
 }
 

@@ -4,8 +4,9 @@ use cubecl::prelude::*;
 
 use crate::adapter::AdapterClass;
 use crate::buffer::{Buffer, Values};
+use crate::elementwise::cast;
 use crate::head_rows::RowsLaunch;
-use crate::matrix_attention as matrix;
+use crate::matrix_attention::{self as matrix, AttentionTile};
 use crate::register_attention::{self as register, ROWS, UNITS};
 
 /// Sizes of an attention.
@@ -47,6 +48,25 @@ pub struct AttentionInputs<'a> {
     pub value: HeadRows<'a>,
 }
 
+impl<'a> AttentionInputs<'a> {
+    fn buffers(&self) -> [&'a Buffer; 3] {
+        [self.query.buffer, self.key.buffer, self.value.buffer]
+    }
+
+    /// Returns the inputs with other buffers, or the same.
+    fn with<'b>(&self, buffers: Option<&'b [Buffer; 3]>) -> AttentionInputs<'b>
+    where
+        'a: 'b,
+    {
+        let [query, key, value] = buffers.map_or(self.buffers(), <[Buffer; 3]>::each_ref);
+        AttentionInputs {
+            query: HeadRows { buffer: query, ..self.query },
+            key: HeadRows { buffer: key, ..self.key },
+            value: HeadRows { buffer: value, ..self.value },
+        }
+    }
+}
+
 impl AttentionSizes {
     fn dim(self) -> usize {
         self.num_heads * self.head_width
@@ -85,17 +105,39 @@ macro_rules! launch {
     };
 }
 
+/// Copies buffers to f16, each once.
+fn in_f16(client: &Client, buffers: [&Buffer; 3]) -> [Buffer; 3] {
+    let first = cast(client, buffers[0], Values::F16);
+    let second =
+        if std::ptr::eq(buffers[1], buffers[0]) { first.clone() } else { cast(client, buffers[1], Values::F16) };
+    let third =
+        if std::ptr::eq(buffers[2], buffers[1]) { second.clone() } else { cast(client, buffers[2], Values::F16) };
+    [first, second, third]
+}
+
 /// Computes `softmax(q k^T / sqrt(E)) v` of every head, `[batch, queries, heads E]` in f32, and the log sums of the scores,
 /// `[batch, heads, queries]`.
 pub fn attention_forward(client: &Client, sizes: AttentionSizes, inputs: &AttentionInputs) -> [Buffer; 2] {
-    let AttentionSizes { batch, num_heads, num_queries, num_keys, head_width, operands } = sizes;
+    let [forward, _] = AdapterClass::of(client).attention_tiles(sizes.operands, sizes.head_width);
+    attention_forward_tile(client, sizes, inputs, forward)
+}
+
+/// Computes [`attention_forward`] with a tile of cooperative matrices, or with register tiles.
+pub fn attention_forward_tile(
+    client: &Client,
+    sizes: AttentionSizes,
+    inputs: &AttentionInputs,
+    tile: Option<AttentionTile>,
+) -> [Buffer; 2] {
+    let AttentionSizes { batch, num_heads, num_queries, num_keys, .. } = sizes;
     let output = Buffer::empty(client, batch * num_queries * sizes.dim(), Values::F32);
     let log_sum = Buffer::empty(client, batch * num_heads * num_queries, Values::F32);
-    let AttentionInputs { query, key, value } = inputs;
+    // Every block of rows reads all keys and values: half the bytes for one more pass.
+    let halves = tile.map(|_| in_f16(client, inputs.buffers()));
+    let AttentionInputs { query, key, value } = &inputs.with(halves.as_ref());
     let to = HeadRows { buffer: &output, column: 0, stride: sizes.dim() };
     let vector = sizes.vector(&[query, key, value, &to]);
     let (scale, elem) = (sizes.scale(), query.buffer.values.elem());
-    let tile = AdapterClass::of(client).attention_tile(operands, head_width);
     // SAFETY: the kernels read and write inside the counts of the rows.
     unsafe {
         launch!(
@@ -143,8 +185,22 @@ pub fn attention_backward(
     results: AttentionResults,
     grads: &AttentionInputs,
 ) {
-    let AttentionSizes { batch, num_heads, num_queries, num_keys, head_width, operands } = sizes;
-    let AttentionInputs { query, key, value } = inputs;
+    let [_, backward] = AdapterClass::of(client).attention_tiles(sizes.operands, sizes.head_width);
+    attention_backward_tile(client, sizes, inputs, results, grads, backward);
+}
+
+/// Computes [`attention_backward`] with a tile of cooperative matrices, or with register tiles.
+pub fn attention_backward_tile(
+    client: &Client,
+    sizes: AttentionSizes,
+    inputs: &AttentionInputs,
+    results: AttentionResults,
+    grads: &AttentionInputs,
+    tile: Option<AttentionTile>,
+) {
+    let AttentionSizes { batch, num_heads, num_queries, num_keys, head_width, .. } = sizes;
+    let halves = tile.map(|_| in_f16(client, inputs.buffers()));
+    let AttentionInputs { query, key, value } = &inputs.with(halves.as_ref());
     let delta = Buffer::empty(client, batch * num_heads * num_queries, Values::F32);
     let units = 64;
     // SAFETY: the kernel reads and writes inside the number of rows.
@@ -161,10 +217,11 @@ pub fn attention_backward(
             head_width,
         );
     }
-    let grad_output = HeadRows { buffer: results.grad_output, column: 0, stride: sizes.dim() };
+    let half = tile.map(|_| cast(client, results.grad_output, Values::F16));
+    let buffer = half.as_ref().unwrap_or(results.grad_output);
+    let grad_output = HeadRows { buffer, column: 0, stride: sizes.dim() };
     let vector = sizes.vector(&[query, key, value, &grad_output, &grads.query, &grads.key, &grads.value]);
-    let (scale, elem) = (sizes.scale(), query.buffer.values.elem());
-    let tile = AdapterClass::of(client).attention_tile(operands, head_width);
+    let (scale, elems) = (sizes.scale(), [query.buffer, grad_output.buffer].map(|x| x.values.elem()));
     // SAFETY: the kernels read and write inside the counts of the rows.
     unsafe {
         launch!(
@@ -190,7 +247,7 @@ pub fn attention_backward(
                 num_heads,
                 scale
             ],
-            elem
+            elems
         );
         launch!(
             tile,
@@ -216,7 +273,7 @@ pub fn attention_backward(
                 num_heads,
                 scale
             ],
-            elem
+            elems
         );
     }
 }

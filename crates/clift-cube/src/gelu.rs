@@ -4,6 +4,7 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
 use crate::buffer::{Buffer, Values};
+use crate::elementwise::{UNITS, elementwise};
 
 /// Returns `exp(-x^2 / 2)`.
 #[cube]
@@ -37,8 +38,6 @@ pub(crate) fn gelu_slope(x: f32) -> f32 {
     let exponential = exponential(x);
     normal(x, exponential) + x * 0.398_942_3f32 * exponential
 }
-
-const UNITS: usize = 256;
 
 #[cube(launch_unchecked)]
 fn forward<X: Float, O: Float, V: Size>(
@@ -113,14 +112,6 @@ pub fn gelu_backward(client: &Client, x: &Buffer, grad: &Buffer) -> Buffer {
         );
     }
     grad_x
-}
-
-/// Returns the width of vectors, and the cubes of a kernel with a unit a vector.
-pub(crate) fn elementwise(len: usize) -> (usize, CubeCount) {
-    let vector = if len.is_multiple_of(4) { 4 } else { 1 };
-    let cubes = (len / vector).div_ceil(UNITS);
-    let columns = cubes.min(1 << 15);
-    (vector, CubeCount::Static(columns as u32, cubes.div_ceil(columns.max(1)) as u32, 1))
 }
 
 #[cfg(test)]

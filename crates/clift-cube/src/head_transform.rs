@@ -4,8 +4,7 @@
 use cubecl::prelude::*;
 
 use crate::buffer::{Buffer, Values};
-
-const UNITS: usize = 256;
+use crate::elementwise::UNITS;
 
 /// How a part of a row is transformed. The transform of a token is block-diagonal: on the first half of a head a 4 x 4 matrix,
 /// on the second half rotations.

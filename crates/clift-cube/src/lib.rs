@@ -15,6 +15,7 @@ mod adapter;
 mod attention;
 mod buffer;
 mod cluster_attention;
+mod elementwise;
 mod epilogue;
 mod gelu;
 mod head_rows;
@@ -35,13 +36,16 @@ mod testing;
 pub use adamw::{AdamW, adamw, gradient_norm};
 pub use adapter::{AdapterClass, ProductTile};
 pub use attention::{
-    AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward, attention_forward,
+    AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward, attention_backward_tile,
+    attention_forward, attention_forward_tile,
 };
 pub use buffer::{Buffer, Matrices, Values};
 pub use cluster_attention::{ClusterSizes, cluster_attention_backward, cluster_attention_forward};
+pub use elementwise::cast;
 pub use gelu::{gelu_backward, gelu_forward};
 pub use head_transform::{PartTransform, transform_heads};
 pub use layer_norm::{layer_norm_backward, layer_norm_forward};
+pub use matrix_attention::AttentionTile;
 pub use matrix_product::{MatrixShape, MatrixTile};
 pub use product::Product;
 pub use reduce::sum_rows;

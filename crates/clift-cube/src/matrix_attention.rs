@@ -427,11 +427,11 @@ fn max_of_plane(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) 
 
 /// Computes the gradient of the queries: `dQ = s dS K`, with `dS = P (dO V^T - delta)`.
 #[cube(launch_unchecked)]
-pub(crate) fn backward_by_queries<F: Float, V: Size>(
+pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
     query: &[Vector<F, V>],
     key: &[Vector<F, V>],
     value: &[Vector<F, V>],
-    grad_output: &[Vector<f32, V>],
+    grad_output: &[Vector<G, V>],
     log_sum: &[f32],
     delta: &[f32],
     grad_query: &mut [Vector<f32, V>],
@@ -443,7 +443,7 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
     num_heads: usize,
     scale: f32,
     #[comptime] tile: AttentionTile,
-    #[define(F)] _values: ElemType,
+    #[define(F, G)] _values: [ElemType; 2],
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
@@ -457,7 +457,7 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
     let fours = comptime!(tile.fours());
 
     let queries = load_rows::<F, V>(&mut keys, query, &query_rows, &head, first_row, tile);
-    let grads = load_rows::<f32, V>(&mut keys, grad_output, &output_rows, &head, first_row, tile);
+    let grads = load_rows::<G, V>(&mut keys, grad_output, &output_rows, &head, first_row, tile);
     let sums = zero_sums(comptime!(tile.matrices()[1]), tile);
     let mut softmax = Array::<Four<f32>>::new(fours);
     let index = CUBE_POS_Y as usize * query_rows.count + min(first_row + row, query_rows.count - 1);
@@ -492,11 +492,11 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
 
 /// Computes the gradients of keys and values: `dV = P^T dO`, `dK = s dS^T Q`.
 #[cube(launch_unchecked)]
-pub(crate) fn backward_by_keys<F: Float, V: Size>(
+pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
     query: &[Vector<F, V>],
     key: &[Vector<F, V>],
     value: &[Vector<F, V>],
-    grad_output: &[Vector<f32, V>],
+    grad_output: &[Vector<G, V>],
     log_sum: &[f32],
     delta: &[f32],
     grad_key_value: &mut [Vector<f32, V>],
@@ -509,7 +509,7 @@ pub(crate) fn backward_by_keys<F: Float, V: Size>(
     num_heads: usize,
     scale: f32,
     #[comptime] tile: AttentionTile,
-    #[define(F)] _values: ElemType,
+    #[define(F, G)] _values: [ElemType; 2],
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
@@ -533,7 +533,7 @@ pub(crate) fn backward_by_keys<F: Float, V: Size>(
     while first < query_rows.count {
         sync_cube();
         stage_block::<F, V>(&mut queries, query, &query_rows, &head, first, tile);
-        stage_block::<f32, V>(&mut grads, grad_output, &output_rows, &head, first, tile);
+        stage_block::<G, V>(&mut grads, grad_output, &output_rows, &head, first, tile);
         sync_cube();
         write_scores(&mut scores, &keys, &queries, tile);
         #[unroll]

@@ -288,11 +288,11 @@ pub(crate) fn forward<F: Float, V: Size>(
 
 /// Computes the gradient of the queries: `dQ = s dS K`, with `dS = P (dO V^T - delta)`.
 #[cube(launch_unchecked)]
-pub(crate) fn backward_by_queries<F: Float, V: Size>(
+pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
     query: &[Vector<F, V>],
     key: &[Vector<F, V>],
     value: &[Vector<F, V>],
-    grad_output: &[Vector<f32, V>],
+    grad_output: &[Vector<G, V>],
     log_sum: &[f32],
     delta: &[f32],
     grad_query: &mut [Vector<f32, V>],
@@ -304,7 +304,7 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
     num_heads: usize,
     scale: f32,
     #[comptime] width: usize,
-    #[define(F)] _values: ElemType,
+    #[define(F, G)] _values: [ElemType; 2],
 ) {
     let head = head_of_cube(num_heads, width);
     let first_row = CUBE_POS_X as usize * ROWS;
@@ -340,7 +340,7 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
             &mut column_stage,
             width,
         );
-        add_scores::<f32, F, V>(
+        add_scores::<G, F, V>(
             &mut grads,
             grad_output,
             value,
@@ -371,11 +371,11 @@ pub(crate) fn backward_by_queries<F: Float, V: Size>(
 
 /// Computes the gradients of keys and values: `dV = P^T dO`, `dK = s dS^T Q`.
 #[cube(launch_unchecked)]
-pub(crate) fn backward_by_keys<F: Float, V: Size>(
+pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
     query: &[Vector<F, V>],
     key: &[Vector<F, V>],
     value: &[Vector<F, V>],
-    grad_output: &[Vector<f32, V>],
+    grad_output: &[Vector<G, V>],
     log_sum: &[f32],
     delta: &[f32],
     grad_key_value: &mut [Vector<f32, V>],
@@ -388,7 +388,7 @@ pub(crate) fn backward_by_keys<F: Float, V: Size>(
     num_heads: usize,
     scale: f32,
     #[comptime] width: usize,
-    #[define(F)] _values: ElemType,
+    #[define(F, G)] _values: [ElemType; 2],
 ) {
     let head = head_of_cube(num_heads, width);
     let first_row = CUBE_POS_X as usize * ROWS;
@@ -424,7 +424,7 @@ pub(crate) fn backward_by_keys<F: Float, V: Size>(
             &mut column_stage,
             width,
         );
-        add_scores::<F, f32, V>(
+        add_scores::<F, G, V>(
             &mut grads,
             value,
             grad_output,
@@ -440,7 +440,7 @@ pub(crate) fn backward_by_keys<F: Float, V: Size>(
         let logs = read_rows(log_sum, start, column_of(first, 0), query_rows.count);
         let deltas = read_rows(delta, start, column_of(first, 0), query_rows.count);
         sync_cube();
-        stage_lines::<f32, V>(&mut lines, grad_output, &output_rows, &head, first, width);
+        stage_lines::<G, V>(&mut lines, grad_output, &output_rows, &head, first, width);
         #[unroll]
         for j in 0..4usize {
             let inside = column_of(first, j) < query_rows.count;
