@@ -19,7 +19,7 @@ const CRATES: [Crate; 11] = [
         "clift-cube",
         "",
         "buffer load elementwise gelu epilogue reduce adamw cluster_attention head_rows head_transform layer_norm rms_norm product_kind register_product \
-         matrix_product register_attention matrix_attention adapter product attention",
+         matrix_product register_scores matrix_scores register_attention matrix_attention adapter product attention",
     ),
     (
         "clift-model",

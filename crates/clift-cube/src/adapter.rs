@@ -5,8 +5,8 @@ use cubecl::prelude::*;
 use half::f16;
 
 use crate::buffer::Values;
-use crate::matrix_attention::AttentionTile;
 use crate::matrix_product::{MatrixShape, MatrixTile};
+use crate::matrix_scores::AttentionTile;
 use crate::register_product::RegisterTile;
 
 /// Class of an adapter.

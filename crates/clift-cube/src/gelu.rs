@@ -121,7 +121,7 @@ mod tests {
 
     #[test]
     fn gelu_and_its_gradient_equal_f64() {
-        let client = client();
+        let Some(client) = client() else { return };
         let x: Vec<f32> = (-60..=60).map(|i| i as f32 / 8.0).collect();
         let grad: Vec<f32> = x.iter().map(|x| 1.5 - x / 10.0).collect();
         let [x_, grad_] = [&x, &grad].map(|x| upload(&client, x, Values::F32));

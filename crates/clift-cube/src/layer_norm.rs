@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn norms_and_their_gradients_equal_f64() {
-        let client = client();
+        let Some(client) = client() else { return };
         for (rows, columns) in [(1, 4), (70, 37), (9, 768)] {
             let [x, gamma, beta, grad] = [(rows * columns, 1), (columns, 2), (columns, 3), (rows * columns, 4)]
                 .map(|(len, seed)| random(len, seed));

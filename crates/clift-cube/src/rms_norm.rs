@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn norms_of_heads_and_their_gradients_equal_f64() {
-        let client = client();
+        let Some(client) = client() else { return };
         for (rows, num_heads, width, norm_parts) in [(70, 2, 12, 2), (3, 1, 96, 1), (5, 3, 37, 3)] {
             let parts = 3;
             let len = rows * parts * num_heads * width;

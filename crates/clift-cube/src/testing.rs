@@ -1,19 +1,47 @@
 //! Devices and tensors of tests.
 
-use cubecl::device::{Device, RuntimeId, WgpuDevice};
+use std::io::Write;
+
+use cubecl::device::{Device, RuntimeId, WgpuDeviceKind};
 use cubecl::prelude::*;
 use cubecl::wgpu::{WgpuServer, WgslCompiler};
 
+use crate::adapter::AdapterClass;
 use crate::buffer::{Buffer, Matrices, Values};
+use crate::matrix_product::MatrixShape;
 
-/// Returns a client of the default adapter, with kernels in SPIR-V if `CLIFT_CUBE_SPIRV` is set, in WGSL otherwise.
-pub(crate) fn client() -> Client {
-    let device = Device::Wgpu(WgpuDevice::default());
-    if std::env::var_os("CLIFT_CUBE_SPIRV").is_some() {
+/// Returns a client of the default adapter, with kernels in SPIR-V if `CLIFT_CUBE_SPIRV` is set, in WGSL otherwise. Without an
+/// adapter prints that the test is skipped, or fails if `CLIFT_REQUIRE_WGPU` is set.
+pub(crate) fn client() -> Option<Client> {
+    let device = match Device::wgpu(WgpuDeviceKind::DefaultDevice) {
+        Ok(device) => device,
+        Err(error) => return skipped("WGPU", &error.to_string()),
+    };
+    Some(if std::env::var_os("CLIFT_CUBE_SPIRV").is_some() {
         device.client()
     } else {
         Client::load::<WgpuServer<WgslCompiler>>(RuntimeId::strip(device.to_id()))
+    })
+}
+
+/// Returns a client of an adapter with cooperative matrices, and their shape, as [`client`].
+pub(crate) fn matrix_client() -> Option<(Client, MatrixShape)> {
+    let client = client()?;
+    match AdapterClass::of(&client) {
+        AdapterClass::Matrices(shape) => Some((client, shape)),
+        AdapterClass::Registers => skipped("MATRICES", "the adapter has no cooperative matrices"),
     }
+}
+
+/// Prints that this test is skipped; fails if `CLIFT_REQUIRE_TOOL` is set.
+fn skipped<T>(tool: &str, reason: &str) -> Option<T> {
+    let variable = format!("CLIFT_REQUIRE_{tool}");
+    assert!(std::env::var_os(&variable).is_none(), "{variable} is set: {reason}");
+    let thread = std::thread::current();
+    let line = format!("skipped: {}: {reason}\n", thread.name().unwrap_or(tool));
+    // Not `eprintln`, whose output the harness hides.
+    std::io::stderr().write_all(line.as_bytes()).expect("the standard error is open");
+    None
 }
 
 /// Returns values in [-1, 1].
@@ -53,12 +81,6 @@ pub(crate) fn rounded(x: f32) -> f32 {
 /// Returns one matrix, row after row.
 pub(crate) fn matrices(buffer: &Buffer, columns: usize) -> Matrices<'_> {
     Matrices::contiguous(buffer, columns)
-}
-
-/// Prints that a test was skipped for an adapter without cooperative matrices; fails if `CLIFT_REQUIRE_MATRICES` is set.
-pub(crate) fn skipped(test: &str) {
-    assert!(std::env::var_os("CLIFT_REQUIRE_MATRICES").is_none(), "the adapter has no cooperative matrices");
-    println!("skipped: {test}: the adapter has no cooperative matrices");
 }
 
 /// Returns the complementary error function, by Simpson's rule.
