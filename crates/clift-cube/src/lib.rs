@@ -1,4 +1,14 @@
 //! GPU kernels of clift, in `CubeCL`: buffers in, buffers out.
+//!
+//! A cube is a workgroup, a unit a thread, a plane a subgroup. No kernel uses atomics and none is chosen by a measurement: a
+//! computation gives the same bytes at every run on an adapter.
+//! - `buffer`, `load`, `elementwise`, `reduce`: buffers and their vectors, sums of columns and rows
+//! - `adapter`: cooperative matrices of an adapter, and the table of tiles
+//! - `product`: products, on `register_product` (f32) or `matrix_product` (cooperative matrices, f16), with an `epilogue`
+//! - `attention`: attention with its backward, on `register_attention` or `matrix_attention`
+//! - `cluster_attention`, `head_transform`, `layer_norm`, `rms_norm`, `gelu`, `adamw`: an operation each
+//!
+//! `examples/sweep.rs` times the tiles of the table.
 #![cfg(feature = "wgpu")]
 #![expect(
     clippy::collapsible_if,
