@@ -1,7 +1,7 @@
 //! The context views of a scene: requested frames, frames along the camera path, or groups of neighbours.
 
 use clift_core::{Pose, PoseNormalization, ViewDistance};
-use clift_data::{ClipReader, DataError, contexts_along_path, is_held_out};
+use clift_data::{ClipReader, DataError, contexts_along_path};
 use clift_model::{ModelConfig, ModelError};
 
 use crate::encode::groups::{nearest_views, neighbour_groups};
@@ -72,7 +72,8 @@ impl Contexts {
     ) -> Result<Self, SceneError> {
         let (key, data) = (reader.source.key(scene), &reader.options);
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
-        let frames = choose_frames(&poses, choice, hold_out)?;
+        let held_out = if hold_out == 0 { Vec::new() } else { reader.source.held_out(scene, hold_out)? };
+        let frames = choose_frames(&poses, choice, &held_out)?;
         let context: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
         let find = |views: &[Pose]| PoseNormalization::find(key, views, &[], data.pose_rotation, data.pose_scale);
         let normalization = find(&context).map_err(DataError::from)?;
@@ -97,9 +98,9 @@ impl Contexts {
 }
 
 /// Chooses frames of a scene that are not held out, or checks those of the choice.
-fn choose_frames(poses: &[Pose], choice: &ContextChoice, hold_out: usize) -> Result<Vec<usize>, SceneError> {
+fn choose_frames(poses: &[Pose], choice: &ContextChoice, held_out: &[usize]) -> Result<Vec<usize>, SceneError> {
     let num_frames = poses.len();
-    let kept: Vec<usize> = (0..num_frames).filter(|&frame| !is_held_out(frame, hold_out)).collect();
+    let kept: Vec<usize> = (0..num_frames).filter(|frame| held_out.binary_search(frame).is_err()).collect();
     let kept_poses: Vec<Pose> = kept.iter().map(|&frame| poses[frame]).collect();
     let spread = |num_views: usize| {
         contexts_along_path(&kept_poses, num_views.min(kept.len())).ok_or_else(|| {
@@ -151,14 +152,14 @@ mod tests {
     fn context_frames_are_checked_spread_or_neighbours() {
         let at = |x: f64| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY };
         let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
-        let frames = |choice: ContextChoice| choose_frames(&poses, &choice, 0).map_err(|error| error.to_string());
+        let frames = |choice: ContextChoice| choose_frames(&poses, &choice, &[]).map_err(|error| error.to_string());
         assert_eq!(frames(ContextChoice::Spread(4)).unwrap(), [0, 3, 6, 9]);
-        assert_eq!(choose_frames(&poses[..3], &ContextChoice::Spread(4), 0).unwrap(), [0, 1, 2]);
+        assert_eq!(choose_frames(&poses[..3], &ContextChoice::Spread(4), &[]).unwrap(), [0, 1, 2]);
         assert_eq!(frames(ContextChoice::Frames(vec![7, 2])).unwrap(), [7, 2]);
         assert_eq!(frames(ContextChoice::Near { frame: 8, num_views: 3 }).unwrap(), [7, 8, 9]);
         let all = ContextChoice::Neighbours { num_views: 4, num_groups: None };
         assert_eq!(frames(all).unwrap(), (0..10).collect::<Vec<_>>());
-        assert_eq!(choose_frames(&poses, &ContextChoice::Spread(9), 4).unwrap(), [1, 2, 3, 5, 6, 7, 9]);
+        assert_eq!(choose_frames(&poses, &ContextChoice::Spread(9), &[0, 4, 8]).unwrap(), [1, 2, 3, 5, 6, 7, 9]);
         let near = frames(ContextChoice::Near { frame: 12, num_views: 3 }).unwrap_err();
         assert_eq!(near, "`--near` = 12: there is no frame 12; the scene has frames 0 to 9");
         let message = |list: &[usize]| frames(ContextChoice::Frames(list.to_vec())).unwrap_err();

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_data::{ClipReader, is_held_out};
+use clift_data::ClipReader;
 use clift_model::TrainedModel;
 
 use crate::check::view_check::CheckedView;
@@ -77,9 +77,12 @@ pub fn encode_scene(
     let stored = write(&coder, &mut encoded, options, (model, reader, index))?;
     let scene = &encoded.scene;
     let num_frames = reader.source.num_frames(index)?;
+    let held_out = match options.encode.hold_out {
+        0 => Vec::new(),
+        every => reader.source.held_out(index, every)?,
+    };
     let is_context = |frame: &usize| scene.context_frames.contains(&(*frame as u32));
-    let held_out: Vec<usize> =
-        (0..num_frames).filter(|&frame| is_held_out(frame, options.encode.hold_out) && !is_context(&frame)).collect();
+    let held_out: Vec<usize> = held_out.into_iter().filter(|frame| !is_context(frame)).collect();
     let image_size = reader.source.image_size(index, scene.context_frames[0] as usize)?;
     Ok(WrittenScene {
         stored,
