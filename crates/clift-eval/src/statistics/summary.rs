@@ -18,7 +18,7 @@ use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
 use crate::statistics::view_metrics::{
-    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SSIM, ViewMetrics, best_method, view_mean,
+    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SHARPNESS, SSIM, ViewMetrics, best_method, view_mean,
 };
 
 /// Means over the views of a scene, then over scenes.
@@ -30,6 +30,8 @@ pub struct Quality {
     pub ssim: Option<f64>,
     /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
+    /// Mean over scenes of the scene's mean sharpness.
+    pub sharpness: Option<f64>,
     /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
 }
@@ -69,6 +71,8 @@ pub struct SummaryPoint {
     pub ssim_per_view: Option<f64>,
     /// Mean LPIPS over all views.
     pub lpips_vgg_per_view: Option<f64>,
+    /// Mean sharpness over all views.
+    pub sharpness_per_view: Option<f64>,
     /// Mean rendering time per view, in seconds.
     pub render_s: Option<f64>,
     /// Median rendering time per view, in seconds.
@@ -231,6 +235,7 @@ impl Quality {
             psnr: mean(&scene_means(views, PSNR)),
             ssim: mean(&scene_means(views, SSIM)),
             lpips_vgg: mean(&scene_means(views, LPIPS)),
+            sharpness: mean(&scene_means(views, SHARPNESS)),
             num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
         }
     }
@@ -250,6 +255,7 @@ impl SummaryPoint {
             psnr_per_view: per_view(PSNR),
             ssim_per_view: per_view(SSIM),
             lpips_vgg_per_view: per_view(LPIPS),
+            sharpness_per_view: per_view(SHARPNESS),
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
             render_p95_s: statistic(&render_s, p95),
@@ -331,7 +337,9 @@ mod tests {
 
     #[test]
     fn the_file_has_the_documented_names() {
-        let mut views = results(&[("a", 0, 20.0)]);
+        let mut views = EvalResults::default();
+        let measured = ViewMetrics { sharpness: Some(0.75), ..ViewMetrics::quality(20.0, Some(0.2)) };
+        views.add("a", 0, CLIFT, measured);
         let copy = ViewMetrics::quality(f64::INFINITY, Some(1.0));
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
         views.split = Some(EvalSplit::HeldOutFrames);
@@ -352,13 +360,14 @@ mod tests {
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],
             "baselines": {
-                "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "num_identical_views": 1},
-                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "num_identical_views": 0}
+                "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "sharpness": null, "num_identical_views": 1},
+                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "sharpness": null, "num_identical_views": 0}
             },
             "points": [{
                 "method": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
                 "num_views": 1, "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
                 "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
+                "sharpness": 0.75, "sharpness_per_view": 0.75,
                 "render_s": null, "render_median_s": null, "render_p95_s": null,
                 "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
                 "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "coded_bytes": null, "peak_bytes": null,

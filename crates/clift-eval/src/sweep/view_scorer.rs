@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use clift_core::ClipViews;
-use clift_model::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures, SSIM_MIN_SIZE_PX, psnr, ssim};
+use clift_model::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures, SSIM_MIN_SIZE_PX, psnr, sharpness, ssim};
 
 use crate::error::EvalError;
 use crate::statistics::view_metrics::ViewMetrics;
@@ -35,7 +35,8 @@ impl<'a> ViewScorer<'a> {
         let has_ssim = height.min(width) >= SSIM_MIN_SIZE_PX;
         let ssim = has_ssim.then(|| ssim(pixels, &target, height, width)).transpose()?;
         let lpips_vgg = self.lpips.map(|lpips| self.lpips_distance(lpips, pixels, &target, view)).transpose()?;
-        Ok(ViewMetrics { lpips_vgg, ..ViewMetrics::quality(psnr(pixels, &target)?, ssim) })
+        let sharpness = sharpness(pixels, &target, height, width)?;
+        Ok(ViewMetrics { lpips_vgg, sharpness, ..ViewMetrics::quality(psnr(pixels, &target)?, ssim) })
     }
 
     fn lpips_distance(&self, lpips: &Lpips, pixels: &[f32], target: &[f32], view: usize) -> Result<f64, EvalError> {
