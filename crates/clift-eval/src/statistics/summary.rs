@@ -8,13 +8,14 @@ use std::path::Path;
 
 use clift_core::{mean, median, p95, quartiles, replace_file, standard_error};
 use clift_data::plural;
+use clift_scene::MIN_CONTEXT_PSNR;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
-use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
+use crate::statistics::eval_results::{ContextCheck, EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
 use crate::statistics::view_metrics::{
@@ -121,6 +122,10 @@ pub struct Summary {
     pub split: Option<EvalSplit>,
     /// Target views that are also contexts: the input holds their images.
     pub num_context_targets: usize,
+    /// Context frames by scene.
+    pub context_frames: BTreeMap<String, Vec<usize>>,
+    /// The context views, rendered from all tokens; `null` on the data of a run's own training.
+    pub context_check: Option<ContextCheck>,
     /// Scenes that the models were trained on.
     pub training_scenes: BTreeSet<String>,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
@@ -166,6 +171,8 @@ impl Summary {
             num_skipped: results.skipped.len(),
             split: results.split,
             num_context_targets: results.context_targets.len(),
+            context_frames: results.context_frames.clone(),
+            context_check: results.context_check,
             training_scenes: results.training_scenes.clone(),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
@@ -181,7 +188,7 @@ impl Summary {
     pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
         let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);
         let split = split.into_iter().chain(training_scenes_note(&self.training_scenes));
-        split.chain(context_targets_note(self.num_context_targets))
+        split.chain(context_targets_note(self.num_context_targets)).chain(self.context_check.and_then(fog_note))
     }
 
     /// Returns the points of the main method in its finest number format.
@@ -220,6 +227,17 @@ pub(crate) fn context_targets_note(num_given: usize) -> Option<String> {
         format!(
             "{num_given} {targets}: nearest_view copies such an image and scores {PSNR_CAP_DB} dB; leave them out with \
              --drop-context-targets"
+        )
+    })
+}
+
+/// Returns the warning about context views that come out as fog; `None` for no such view.
+fn fog_note(ContextCheck { num_views, num_fog }: ContextCheck) -> Option<String> {
+    (num_fog > 0).then(|| {
+        format!(
+            "{num_fog} of {num_views} context views, rendered from all tokens, are below {MIN_CONTEXT_PSNR} dB or worse than \
+             the mean image, as fog: the contexts of a scene are too far apart for the model; choose nearer ones with \
+             --index, or train on the data set (configs/capture.toml)"
         )
     })
 }
@@ -344,6 +362,8 @@ mod tests {
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
+        views.context_frames.insert("a".into(), vec![0, 4]);
+        views.add_context_check(ContextCheck { num_views: 2, num_fog: 1 });
         views.training_scenes.insert("a".into());
         let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
@@ -355,6 +375,7 @@ mod tests {
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
+            "context_frames": {"a": [0, 4]}, "context_check": {"num_views": 2, "num_fog": 1},
             "training_scenes": ["a"],
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
@@ -377,6 +398,17 @@ mod tests {
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), summary);
+    }
+
+    #[test]
+    fn fog_is_counted_in_a_warning() {
+        for (num_fog, expected) in [(3, Some("3 of 8 context views, rendered from all tokens, are below 23 dB")), (0, None)] {
+            let mut views = results(&[("a", 0, 20.0)]);
+            views.add_context_check(ContextCheck { num_views: 8, num_fog });
+            let warning = Summary::new(&views).warnings().next();
+            assert_eq!(warning.is_some(), expected.is_some(), "{warning:?}");
+            assert!(warning.unwrap_or_default().starts_with(expected.unwrap_or_default()));
+        }
     }
 
     #[test]
