@@ -50,7 +50,10 @@ fn runs_without_test_split_are_measured_on_held_out_frames() {
     // Weights beside the data, without the knowledge of what was held out.
     let foreign = "eval --checkpoint DIR/run/stage1 --data REPO/data-fixtures/re10k-mini/train --out DIR/";
     place.clift(&format!("{foreign}all")).ok();
-    place.clift(&format!("{foreign}held-out --set data.hold_out=4")).ok().prints(" context views, rendered from all tokens");
+    place
+        .clift(&format!("{foreign}held-out --set data.hold_out=4"))
+        .ok()
+        .prints(" context views, rendered from all tokens");
     assert_eq!(target_frames(&place, "held-out"), target_frames(&place, "run/eval"));
     assert!(target_frames(&place, "all").iter().any(|frame| frame % 4 != 0));
     let contexts = |eval: &str| place.json(&format!("{eval}/summary.json"))["context_frames"].clone();

@@ -107,9 +107,10 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
             ssim: view_mean(views, SSIM),
             lpips_vgg: view_mean(views, LPIPS),
             sharpness: view_mean(views, SHARPNESS),
-            context_frames: results.context_frames.get(scene).map(|frames| {
-                frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
-            }),
+            context_frames: results
+                .context_frames
+                .get(scene)
+                .map(|frames| frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")),
         })
     });
     write(path, rows).map_err(EvalError::io("writing the means of the scenes", path))

@@ -402,7 +402,9 @@ mod tests {
 
     #[test]
     fn fog_is_counted_in_a_warning() {
-        for (num_fog, expected) in [(3, Some("3 of 8 context views, rendered from all tokens, are below 23 dB")), (0, None)] {
+        for (num_fog, expected) in
+            [(3, Some("3 of 8 context views, rendered from all tokens, are below 23 dB")), (0, None)]
+        {
             let mut views = results(&[("a", 0, 20.0)]);
             views.add_context_check(ContextCheck { num_views: 8, num_fog });
             let warning = Summary::new(&views).warnings().next();

@@ -122,13 +122,13 @@ pub fn sharpness(pred: &[f32], target: &[f32], height: usize, width: usize) -> R
 
 fn mean_gradient(image: &[f32], width: usize) -> f64 {
     let luminance = |pixel: &[f32]| {
-        pixel.iter().zip(LUMINANCE).map(|(&value, weight)| weight * f64::from(value.clamp(0.0, 1.0))).sum()
+        pixel.iter().zip(LUMINANCE).map(|(&value, weight)| weight * f64::from(value.clamp(0.0, 1.0))).sum::<f64>()
     };
     let plane: Vec<f64> = image.chunks_exact(3).map(luminance).collect();
     let rows: Vec<&[f64]> = plane.chunks_exact(width).collect();
-    let magnitudes = rows.windows(2).flat_map(|rows| {
-        (1..width).map(|x| (rows[0][x] - rows[0][x - 1]).hypot(rows[1][x - 1] - rows[0][x - 1]))
-    });
+    let magnitudes = rows
+        .windows(2)
+        .flat_map(|rows| (1..width).map(move |x| (rows[0][x] - rows[0][x - 1]).hypot(rows[1][x - 1] - rows[0][x - 1])));
     magnitudes.sum::<f64>() / ((rows.len() - 1) * (width - 1)) as f64
 }
 

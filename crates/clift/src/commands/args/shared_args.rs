@@ -49,8 +49,8 @@ impl ConfigArgs {
 
     /// Whether `--set` gives a key, even with the value of the config.
     pub fn sets(&self, section: &str, key: &str) -> bool {
-        let tables = self.set.iter().filter_map(|text| text.parse::<toml::Table>().ok());
-        tables.into_iter().any(|table| table.get(section).is_some_and(|section| section.get(key).is_some()))
+        let mut tables = self.set.iter().filter_map(|text| text.parse::<toml::Table>().ok());
+        tables.any(|table| table.get(section).is_some_and(|section| section.get(key).is_some()))
     }
 }
 
