@@ -8,14 +8,24 @@ use crate::support::{repository, sources};
 /// A crate, the crates that it may use, and its folders and root files: each imports only those that stand before it.
 type Crate = (&'static str, &'static str, &'static str);
 
-const CRATES: [Crate; 10] = [
+const CRATES: [Crate; 11] = [
     ("clift-core", "", "error statistics random rgb_image files geometry clip_views"),
     (
         "clift-kernels",
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    ("clift-model", "clift-core clift-kernels", "error names device ops views tokens network cost weights metrics"),
+    (
+        "clift-cube",
+        "",
+        "buffer load elementwise gelu epilogue reduce adamw cluster_attention head_rows head_transform layer_norm rms_norm product_kind register_product \
+         matrix_product register_scores matrix_scores register_attention matrix_attention adapter product attention",
+    ),
+    (
+        "clift-model",
+        "clift-core clift-cube clift-kernels",
+        "error names device ops views tokens network cost weights metrics",
+    ),
     (
         "clift-data",
         "clift-core",

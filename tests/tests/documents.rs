@@ -7,6 +7,7 @@ use std::process::Command;
 use clift_data::{StateDict, write_state_dict};
 use serde_json::json;
 
+use crate::data::poses::write_colmap;
 use crate::evaluation::eval::write_vgg;
 use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, start};
 use crate::viewer::tab::Viewer;
@@ -70,6 +71,7 @@ fn every_documented_command_runs() {
     let place = Place::new();
     let base = place.at("base");
     prepare(&base);
+    write_colmap(&place);
     let (mut failures, mut names, mut count) = (Vec::new(), BTreeSet::new(), 0);
     for (i, (document, text)) in documents.iter().enumerate() {
         let folder = place.at(&format!("document-{i}"));
@@ -90,7 +92,11 @@ fn every_documented_command_runs() {
                 drop(Viewer::start(&words, &folder));
                 continue;
             }
-            let ran = finish(start(Command::new(BINARY).args(&args).current_dir(&folder)));
+            let mut command = Command::new(BINARY);
+            if args.starts_with(&["data".into(), "poses".into()]) {
+                command.env("PATH", place.at("bin"));
+            }
+            let ran = finish(start(command.args(&args).current_dir(&folder)));
             // A check with a flagged scene is a result.
             let is_flagged =
                 args.starts_with(&["data".into(), "check".into()]) && ran.code == Some(1) && !ran.stdout.is_empty();
@@ -212,6 +218,7 @@ fn shrink(args: &mut Vec<String>) {
             default(args, "--frames", "8");
             default(args, "--size", "32x32");
         }
+        ("data", Some("poses")) => "photos".clone_into(&mut args[2]), // for a film too
         ("data", Some("info")) if args.iter().any(|arg| arg == "configs/re10k.toml") => {
             set(args, &SMALL_RUN[1..6]);
             set(args, &["data.root=PATH"]);
@@ -242,6 +249,7 @@ fn prepare(base: &Path) {
     for name in ["captures/attic", "captures/fox"] {
         copy(&fixture("layouts/colmap_txt/attic"), name);
     }
+    copy(&fixture("layouts/colmap_bin/attic/images"), "photos");
     copy(&fixture("layouts/re10k_txt"), "data/re10k-txt");
     copy(&fixture("layouts/dl3dv"), "data/dl3dv");
     copy(&fixture("layouts/dl3dv"), "DL3DV-ALL-480P");

@@ -140,7 +140,6 @@ fn sample_frames(num_frames: usize, [num_context, num_targets]: [usize; 2], rng:
 
 #[cfg(test)]
 mod tests {
-    use clift_core::{PoseRotation, PoseScale};
     use clift_data::{SyntheticConfig, SyntheticSource};
 
     use super::*;
@@ -149,13 +148,7 @@ mod tests {
     fn clips_are_read_in_order_and_at_random() {
         let config = SyntheticConfig { num_scenes: 3, num_frames: 12, width: 16, height: 16, ..Default::default() };
         let source: Arc<dyn SceneSource> = Arc::new(SyntheticSource::new(config).unwrap());
-        let clip = ClipOptions {
-            width: 8,
-            height: 8,
-            pose_rotation: PoseRotation::Quaternion,
-            pose_scale: PoseScale::Context,
-            exact_principal_point: false,
-        };
+        let clip = ClipOptions { width: 8, height: 8, ..ClipOptions::default() };
         let options = ThroughputOptions { clip, num_views: [4, 3], num_clips: 7, num_threads: 2, seed: 1 };
         let measured = measure_reading(&source, &options).unwrap();
         assert_eq!((measured.sequential.len(), measured.random.len()), (7, 7));

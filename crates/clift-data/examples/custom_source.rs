@@ -9,7 +9,7 @@
 
 use std::sync::Arc;
 
-use clift_core::{Camera, DVec3, IntrinsicsNorm, Pose, PoseRotation, PoseScale, RgbImage};
+use clift_core::{Camera, DVec3, IntrinsicsNorm, Pose, RgbImage};
 use clift_data::{ClipOptions, ClipReader, DataError, SceneSource, ViewIndices};
 
 struct Wall;
@@ -41,13 +41,7 @@ impl SceneSource for Wall {
 }
 
 fn main() -> Result<(), DataError> {
-    let options = ClipOptions {
-        width: 32,
-        height: 32,
-        pose_rotation: PoseRotation::Quaternion,
-        pose_scale: PoseScale::Context,
-        exact_principal_point: false,
-    };
+    let options = ClipOptions { width: 32, height: 32, ..ClipOptions::default() };
     let reader = ClipReader { source: Arc::new(Wall), options };
     let clip = reader.read(0, &ViewIndices { context: vec![0, 3, 7], target: vec![5] })?;
     println!("{}: {} context views, {} target view", clip.key, clip.context.num_views(), clip.target.num_views());

@@ -35,6 +35,8 @@ pub struct DataConfig {
     pub pose_scale: PoseScale,
     /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
     pub crop: Crop,
+    /// Colour of masked and transparent pixels, RGB of 0 to 255.
+    pub background: [u8; 3],
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     pub flip: bool,
     /// For data sets without a test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
@@ -65,6 +67,7 @@ impl Default for DataConfig {
             pose_rotation: PoseRotation::default(),
             pose_scale: PoseScale::default(),
             crop: Crop::Protocol,
+            background: [0; 3],
             flip: false,
             hold_out: 8,
             filters: SceneFilters::default(),
@@ -97,6 +100,7 @@ impl DataConfig {
             pose_rotation: self.pose_rotation,
             pose_scale: self.pose_scale,
             exact_principal_point: self.crop == Crop::Exact,
+            half_size: false,
         }
     }
 }

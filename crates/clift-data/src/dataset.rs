@@ -6,8 +6,7 @@ use rayon::prelude::*;
 
 use crate::config::DataConfig;
 use crate::error::DataError;
-use crate::sampling::clip_reader::ClipReader;
-use crate::sampling::training_clips::ReadClip;
+use crate::sampling::clip_reader::{ClipOptions, ClipReader};
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
 use crate::sources::chunks::chunk_source::ScanProgress;
@@ -56,6 +55,7 @@ fn open_files(
         kind,
         filters,
         files,
+        background: config.background,
         min_size: [config.width, config.height],
         image_cache: Some(config.image_cache.clone()),
         reads_chunks: false,
@@ -109,24 +109,24 @@ pub fn open_training_dataset(
     Ok(OpenedSource { source: Arc::new(SceneSubset::new(source, long)), ..opened })
 }
 
-/// Returns what reads the clips of `reader`, training scenes of the data set of `config`, with half as many columns and rows.
+/// Returns a reader of the same training clips as `reader`, of the data set of `config`, with half as many columns and rows.
 ///
 /// Images are reduced after they are fitted to the whole size. Synthetic scenes that need no crop are drawn at half the size,
 /// which is faster.
 ///
 /// # Errors
 /// [`DataError::BadConfig`] for synthetic scenes too small to halve.
-pub fn half_resolution_clips(config: &DataConfig, reader: &ClipReader) -> Result<Arc<ReadClip>, DataError> {
+pub fn half_size_reader(config: &DataConfig, reader: &ClipReader) -> Result<ClipReader, DataError> {
     let SyntheticConfig { width, height, .. } = config.synthetic;
     let is_even = width.is_multiple_of(2) && height.is_multiple_of(2);
     if config.source == SourceKind::Synthetic && is_even && width * config.height == height * config.width {
         let half = config.at_half_resolution();
-        let source = SyntheticSource::new(SyntheticConfig { split: Split::Train, ..half.synthetic.clone() })?;
-        let drawn = ClipReader { source: Arc::new(source), options: half.clip_options() };
-        return Ok(Arc::new(move |scene, views| drawn.read(scene, views)));
+        let drawn = SyntheticSource::new(SyntheticConfig { split: Split::Train, ..half.synthetic.clone() })?;
+        let source = SceneSubset::first(Arc::new(drawn), reader.source.num_scenes());
+        return Ok(ClipReader { source: Arc::new(source), options: half.clip_options() });
     }
-    let whole = reader.clone();
-    Ok(Arc::new(move |scene, views| Ok(whole.read(scene, views)?.at_half_resolution())))
+    let options = ClipOptions { half_size: true, ..reader.options };
+    Ok(ClipReader { source: reader.source.clone(), options })
 }
 
 #[cfg(test)]
@@ -147,8 +147,8 @@ mod tests {
         let read = |data: &DataConfig| {
             let source = open_dataset(data, Split::Train, &mut |_, _| ()).unwrap().source;
             let reader = ClipReader { source, options: data.clip_options() };
-            let half = half_resolution_clips(data, &reader).unwrap();
-            (half(1, &views).unwrap(), reader.read(1, &views).unwrap().at_half_resolution())
+            let half = half_size_reader(data, &reader).unwrap();
+            (half.read(1, &views).unwrap(), reader.read(1, &views).unwrap().at_half_resolution())
         };
         let (drawn, reduced) = read(&data);
         assert_eq!((drawn.key, drawn.target.width, drawn.target.height), (reduced.key, 16, 8));

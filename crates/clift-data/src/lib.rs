@@ -34,7 +34,7 @@ mod torch;
 
 // Opening a data set.
 pub use config::DataConfig;
-pub use dataset::{half_resolution_clips, open_dataset, open_training_dataset};
+pub use dataset::{half_size_reader, open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
 pub use scene_source::{SceneSource, Split, is_held_out};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
@@ -62,17 +62,17 @@ pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views
 pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
-pub use sampling::training_clips::{ReadClip, TrainingClips};
+pub use sampling::training_clips::TrainingClips;
 pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Lenses, files of poses, and measures on poses.
-pub use geometry::lens::Lens;
+pub use geometry::lens::{Lens, Projection};
 pub use geometry::overlap::overlap;
 pub use geometry::path_spread::contexts_along_path;
 pub use geometry::pose_file::read_poses;
 
 // Images.
-pub use image::codec::{decode_image, encode_jpeg, encode_png};
+pub use image::codec::{decode_image, encode_jpeg, encode_png, image_size};
 pub use image::fit::{Crop, fit_image};
 pub use image::undistort::Undistortion;
 

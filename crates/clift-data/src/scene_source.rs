@@ -70,6 +70,13 @@ pub trait SceneSource: Send + Sync {
 
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError>;
+    /// Decodes one frame, and its coverage where a mask or an alpha channel leaves pixels out: an image of the same size
+    /// whose three channels are 255 where a pixel counts and 0 where it does not. The pixels left out have the background
+    /// colour. The default has no coverage.
+    fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
+        Ok((self.frame(scene, frame)?, None))
+    }
+
     /// Returns the bytes of the JPEG or PNG file of a frame; `None` for images that are computed, or resampled on load.
     fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         Ok(None)

@@ -3,6 +3,9 @@
 //! [`Evaluator`] measures trained models on test scenes with every method
 //! and token count, and writes tables, contact sheets and an HTML report.
 
+// The JSON of a summary in a test.
+#![cfg_attr(test, recursion_limit = "256")]
+
 mod config;
 mod error;
 mod evaluator;

@@ -2,15 +2,15 @@
 //!
 //! The [`Encoder`] turns posed context views into light-field tokens, latent K-means ([`KMeans`]) groups the tokens, and
 //! the [`Condenser`] writes every group into its centroid. To render, the [`Selector`] selects the tokens nearest to a
-//! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Clift`] holds them.
+//! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Network`] holds them.
 //!
 //! ```
 //! use clift_core::{Camera, ClipViews, Intrinsics, Pose};
-//! use clift_model::{Cameras, Clift, DeviceName, KMeans, ModelConfig, Views};
+//! use clift_model::{Cameras, Network, DeviceName, KMeans, ModelConfig, Views};
 //!
 //! let device = DeviceName::Flex.open()?;
 //! let config = ModelConfig { dim: 16, num_heads: 2, feed_forward_dim: 32, ..ModelConfig::default() };
-//! let model = Clift::new(&config, 0, &device);
+//! let model = Network::new(&config, 0, &device);
 //!
 //! // One scene of two gray views of 16 x 16 pixels, both at the origin.
 //! let (width, height) = (16, 16);
@@ -88,7 +88,7 @@ pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
 pub use network::camera_encoding::TokenTransforms;
 pub use network::config::{CondenserConfig, ModelConfig};
 pub use network::init::Init;
-pub use network::model::Clift;
+pub use network::model::Network;
 pub use network::parts::condenser::Condenser;
 pub use network::parts::encoder::Encoder;
 pub use network::parts::renderer::Renderer;

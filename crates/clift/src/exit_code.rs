@@ -28,6 +28,11 @@ pub(crate) fn error_message(error: &anyhow::Error) -> String {
 #[error("{0}")]
 pub(crate) struct UsageError(pub(crate) String);
 
+/// A signal ended a command that continues where it was.
+#[derive(Debug, thiserror::Error)]
+#[error("interrupted; the same command continues")]
+pub(crate) struct Interrupted;
+
 /// Returns a [`UsageError`] with a formatted message from the function.
 macro_rules! usage_bail {
     ($($message:tt)*) => {
@@ -39,6 +44,9 @@ pub(crate) use usage_bail;
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     if error.is::<UsageError>() || error.is::<ConfigError>() || error.is::<BadConfig>() {
         return USAGE;
+    }
+    if error.is::<Interrupted>() {
+        return interrupt::exit_code();
     }
     if let Some(error) = error.downcast_ref::<DataError>() {
         return data_exit_code(error);

@@ -54,6 +54,7 @@ pub fn main() -> ExitCode {
         Command::Render(args) => render::run::run(&args),
         Command::View(args) => view::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
+        Command::Data { command: DataCommand::Poses(args) } => data::poses::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
         Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),
         Command::Data { command: DataCommand::Index(args) } => data::index::run(&args),

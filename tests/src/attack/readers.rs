@@ -10,7 +10,7 @@ use clift_data::{
     ChunkSource, DatasetRoot, EvaluationIndex, Pickle, SceneFilters, SceneSource, SourceOptions, Split, TestScenes,
     decode_image, encode_jpeg, encode_png, open_source,
 };
-use clift_model::{Clift, CliftVariant, load_part};
+use clift_model::{CliftVariant, Network, load_part};
 use clift_scene::{Scene, TokenCodec};
 use clift_train::{
     CheckpointConfig, Checkpoints, ClusterCache, Config, ImportOptions, OptimizerConfig, Run, TrainState, import,
@@ -120,7 +120,7 @@ pub fn test_scenes(setup: &Setup, _: &'static str) -> Read {
 pub fn weights(setup: &Setup, _: &'static str) -> Read {
     let model = setup.model();
     file(setup, "model.safetensors", move |path| {
-        let loaded = load_part(&mut model.clone(), &Clift::stage1_part(), path).map_err(|error| error.to_string())?;
+        let loaded = load_part(&mut model.clone(), &Network::stage1_part(), path).map_err(|error| error.to_string())?;
         done(loaded.require_all(path))
     })
 }

@@ -5,7 +5,7 @@ use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use clift_model::Clift;
+use clift_model::Network;
 use clift_train::{Config, read_config};
 use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
@@ -46,8 +46,8 @@ impl Setup {
     }
 
     /// The model of the run, with other weights.
-    pub fn model(&self) -> Clift {
-        Clift::new(&self.config.model, 1, &burn::tensor::Device::flex().autodiff())
+    pub fn model(&self) -> Network {
+        Network::new(&self.config.model, 1, &burn::tensor::Device::flex().autodiff())
     }
 
     /// The newest checkpoint of stage 1.

@@ -3,3 +3,4 @@
 mod convert;
 mod data_tools;
 mod layouts;
+pub(crate) mod poses;

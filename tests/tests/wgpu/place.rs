@@ -6,7 +6,7 @@ use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use clift_core::{Camera, ClipViews, DMat3, DVec3, Intrinsics, Pose};
 use clift_data::Clip;
 use clift_model::{
-    Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, ModelConfig, Renderer, SceneClusters,
+    Cameras, CliftVariant, Condenser, CondenserConfig, Encoder, Init, ModelConfig, Network, Renderer, SceneClusters,
     Views,
 };
 use rand::{RngExt, SeedableRng};
@@ -71,9 +71,9 @@ impl Place {
         make(&mut Init::of(network, 7, &self.device)).map(&mut Move)
     }
 
-    pub fn model(&self) -> Clift {
+    pub fn model(&self) -> Network {
         let config = network(CliftVariant::Paper);
-        self.module(|init| Clift {
+        self.module(|init| Network {
             encoder: Encoder::new(&config, init),
             renderer: Renderer::new(&config, init),
             condenser: Condenser::new(&config, init),
@@ -101,7 +101,12 @@ impl Place {
                 frame_index: vec![0, 1],
             }
         };
-        Clip { key: format!("scene {scene}"), context: views([-0.8, 0.7]), target: views([-0.3, 0.4]) }
+        Clip {
+            key: format!("scene {scene}"),
+            context: views([-0.8, 0.7]),
+            target: views([-0.3, 0.4]),
+            target_weights: None,
+        }
     }
 
     pub fn clips(&self) -> Vec<Clip> {

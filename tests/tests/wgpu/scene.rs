@@ -6,7 +6,7 @@ use burn::module::Module;
 use clift_core::{Camera, Pose};
 use clift_data::{ClipReader, DataConfig, Split, SyntheticConfig, ViewSampler, open_dataset};
 use clift_model::{CliftVariant, SelectionPreset, TokenCount, TrainedModel, save_weights};
-use clift_scene::{EncodeOptions, Scene, SceneRenderer, TokenFormat, encode, load_renderer};
+use clift_scene::{ContextChoice, EncodeOptions, Scene, SceneRenderer, TokenFormat, encode, load_renderer};
 use clift_train::Config;
 
 use crate::cpu;
@@ -54,8 +54,8 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let reader = ClipReader { source, options: config.data.clip_options() };
     let trained = TrainedModel::snapshot(&place.model().valid(), &config.model, true);
     let options = EncodeOptions {
-        context: None,
-        num_context: config.data.views.max_context,
+        context: ContextChoice::Spread(config.data.views.max_context),
+        hold_out: 0,
         stored_tokens: Some(TokenCount::Count(STORED)),
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),

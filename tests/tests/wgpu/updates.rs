@@ -1,6 +1,6 @@
 //! Whole updates by the code of training: loss, gradient, AdamW.
 
-use clift_model::{Clift, Clusters, RenderTokens, upload_images};
+use clift_model::{Clusters, Network, RenderTokens, upload_images};
 use clift_train::{BatchTokens, Loss, OptimizerConfig, Rendering, Stage, StageBatch, TrainState, freeze};
 
 use crate::modules::subsets;
@@ -52,7 +52,7 @@ fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: b
     Values { forward: numbers.map(|(name, value)| (name.to_owned(), vec![value])).into(), backward }
 }
 
-fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
+fn gradient(place: &Place, model: &Network, batch: &StageBatch) -> Named {
     let lift = model.encode(&place.context());
     let tokens: RenderTokens = match &batch.tokens {
         BatchTokens::Subsets(subsets) => RenderTokens::subsets(lift, subsets),

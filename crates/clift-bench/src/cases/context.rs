@@ -8,7 +8,7 @@ use burn::module::Module;
 use burn::tensor::Device;
 use clift_core::BadConfig;
 use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
-use clift_model::{Clift, DeviceName, ModelConfig, TokenCount, Tokens, Views};
+use clift_model::{DeviceName, ModelConfig, Network, TokenCount, Tokens, Views};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
@@ -167,7 +167,7 @@ impl BenchContext {
         seeded_clip(ClipShape { num_targets, ..self.shape() }, self.config.seed, 0)
     }
 
-    pub fn model(&self) -> Clift {
+    pub fn model(&self) -> Network {
         seeded_model(&self.config.model, self.config.seed, &self.device)
     }
 

@@ -8,7 +8,7 @@ use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer,
 use clift_train::{TrainError, seeded_clusters, seeded_uniform};
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{Network, ToF64, relative_error};
+use crate::cases::reference::{ToF64, Weights, relative_error};
 use crate::cases::task::BenchTask;
 
 /// A computation without gradient, with a numeric result.
@@ -49,9 +49,9 @@ impl<I: ToF64> BenchTask for Forward<I> {
 }
 
 /// Encoder: context views to tokens.
-pub fn encode(context: &BenchContext) -> Result<Forward<(Network<Encoder>, Views)>, TrainError> {
+pub fn encode(context: &BenchContext) -> Result<Forward<(Weights<Encoder>, Views)>, TrainError> {
     let views = Views::upload(&[&context.clip(1).context], &context.device)?;
-    let encoder = Network(context.model().encoder.valid());
+    let encoder = Weights(context.model().encoder.valid());
     Ok(Forward::new((encoder, views), |(encoder, views)| encoder.0.forward(views).values.flatten(0, 2)))
 }
 
@@ -68,12 +68,12 @@ impl ToF64 for UploadedClusters {
 }
 
 /// Condenser: tokens and clusters to condensed tokens.
-pub fn condense(context: &BenchContext) -> Result<Forward<(Network<Condenser>, Tokens, UploadedClusters)>, TrainError> {
+pub fn condense(context: &BenchContext) -> Result<Forward<(Weights<Condenser>, Tokens, UploadedClusters)>, TrainError> {
     let lift = context.lift()?;
     let count = context.num_storage_tokens()?;
     let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.config.seed, 0)?])?;
     let clusters = UploadedClusters { index: clusters.upload(&context.device), clusters };
-    let condenser = Network(context.model().condenser.valid());
+    let condenser = Weights(context.model().condenser.valid());
     Ok(Forward::new((condenser, lift, clusters), |(condenser, lift, clusters)| {
         condenser.0.forward(lift.clone(), &clusters.index).values.flatten(0, 2)
     }))
@@ -107,11 +107,11 @@ pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward<Attention
 pub fn render(
     context: &BenchContext,
     num_views: usize,
-) -> Result<Forward<(Network<Renderer>, Tokens, Cameras)>, TrainError> {
+) -> Result<Forward<(Weights<Renderer>, Tokens, Cameras)>, TrainError> {
     let ids: Vec<u32> = (0..context.num_render_tokens()? as u32).collect();
     let lift = context.lift()?.select(&ids);
     let targets = Cameras::upload(&[&context.clip(num_views).target], &context.device)?;
-    let renderer = Network(context.model().renderer.valid());
+    let renderer = Weights(context.model().renderer.valid());
     let render = Forward::new((renderer, lift, targets), |(renderer, lift, targets)| {
         renderer.0.forward(lift.clone(), targets).flatten(0, 4)
     });

@@ -55,9 +55,9 @@ impl<A: ToF64, B: ToF64, C: ToF64> ToF64 for (A, B, C) {
 }
 
 /// A network among the inputs.
-pub struct Network<M>(pub M);
+pub struct Weights<M>(pub M);
 
-impl<M: Module> ToF64 for Network<M> {
+impl<M: Module> ToF64 for Weights<M> {
     fn in_f64(&self, reference: &Device) -> Self {
         Self(module_in_f64(&self.0, reference))
     }

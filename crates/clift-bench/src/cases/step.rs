@@ -3,7 +3,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
-use clift_model::{Clift, Precision};
+use clift_model::{Network, Precision};
 use clift_train::{
     DeviceBatch, Loss, LossScale, Stage, StageBatch, StageOptimizer, StageSettings, StepAnomaly, TrainError,
     TrainState, freeze, learning_rate, render_loss, seeded_batch,
@@ -93,13 +93,14 @@ impl ToF64 for DeviceBatch {
             context: self.context.in_f64(reference),
             targets: self.targets.in_f64(reference),
             target_images: self.target_images.in_f64(reference),
+            target_weights: None, // of seeded views, which have no masks
         }
     }
 }
 
 /// Returns the loss of a batch and the gradient of every parameter, multiplied by [`loss_factor`].
 fn gradients(
-    model: &Clift,
+    model: &Network,
     batch: &StageBatch,
     device_batch: DeviceBatch,
 ) -> Result<(f64, GradientsParams), TrainError> {
@@ -110,7 +111,7 @@ fn gradients(
 
 /// Returns the loss of a batch and the whole gradient, in the precision of this thread.
 pub(crate) fn loss_and_gradient(
-    model: &Clift,
+    model: &Network,
     batch: &StageBatch,
     device: &Device,
 ) -> Result<(f64, Vec<f64>), TrainError> {
@@ -131,7 +132,7 @@ fn loss_factor() -> f64 {
 /// all parameters if that is larger: a gradient that is zero in exact arithmetic, such as that of a query with one key,
 /// is rounding noise.
 pub(crate) fn update_error(
-    model: &Clift,
+    model: &Network,
     batch: &StageBatch,
     device: &Device,
     reference: &Device,

@@ -29,14 +29,36 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 /// [`DataError::BadImage`] with `key` and `frame` for another format, broken or truncated data, and a side above
 /// 16,384 pixels.
 pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
-    let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
+    rgb_image(decode(bytes, key, frame)?.into_rgb8()).map_err(|what| bad_image(key, frame, what))
+}
+
+/// Decodes a JPEG or PNG file as [`decode_image`], and its alpha channel, `[height, width]`, if it has one.
+pub(crate) fn decode_with_alpha(
+    bytes: &[u8],
+    key: &str,
+    frame: usize,
+) -> Result<(RgbImage, Option<Vec<u8>>), DataError> {
+    let image = decode(bytes, key, frame)?;
+    let alpha = image.color().has_alpha().then(|| image.to_rgba8().pixels().map(|pixel| pixel.0[3]).collect());
+    Ok((rgb_image(image.into_rgb8()).map_err(|what| bad_image(key, frame, what))?, alpha))
+}
+
+fn bad_image(key: &str, frame: usize, what: String) -> DataError {
+    DataError::BadImage { key: key.to_owned(), frame, what }
+}
+
+fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<DynamicImage, DataError> {
+    let bad = |what: String| bad_image(key, frame, what);
     let format = known_format(bytes).map_err(bad)?;
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(limits());
-    let image = reader.decode().map_err(|error| bad(error.to_string()))?.into_rgb8();
+    reader.decode().map_err(|error| bad(error.to_string()))
+}
+
+fn rgb_image(image: image::RgbImage) -> Result<RgbImage, String> {
     let (width, height) = image.dimensions();
     if width == 0 || height == 0 {
-        return Err(bad(format!("the image is {width}x{height}")));
+        return Err(format!("the image is {width}x{height}"));
     }
     Ok(RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() })
 }
@@ -102,6 +124,21 @@ pub(crate) fn read_header(path: &Path) -> Result<([usize; 2], Orientation), Data
     // Broken EXIF data does not affect the pixels.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     Ok(([width as usize, height as usize], orientation))
+}
+
+/// Returns whether a file is a PNG with an alpha channel; `false` for a file that cannot be read.
+pub(crate) fn has_alpha(path: &Path) -> bool {
+    let is_png = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png"));
+    let decoder = || ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok();
+    is_png && decoder().is_some_and(|decoder| decoder.color_type().has_alpha())
+}
+
+/// Returns the columns and rows of a JPEG or PNG file, as stored.
+///
+/// # Errors
+/// [`DataError::Io`] and [`DataError::BadScene`] for a file that cannot be read or has another format.
+pub fn image_size(path: &Path) -> Result<[usize; 2], DataError> {
+    read_header(path).map(|(size, _)| size)
 }
 
 /// Returns the EXIF orientation of a JPEG or PNG file in memory.

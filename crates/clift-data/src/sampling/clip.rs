@@ -30,4 +30,7 @@ pub struct Clip {
     pub context: ClipViews,
     /// Target views with their ground-truth images.
     pub target: ClipViews,
+    /// Weights of the target pixels in loss and metrics, `[num_views, height, width]`: 255 counts, 0 is masked or
+    /// transparent. `None` where every pixel counts.
+    pub target_weights: Option<Vec<u8>>,
 }

@@ -15,9 +15,9 @@ use crate::scene_source::SceneSource;
 /// Options for the preparation of frames and poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClipOptions {
-    /// Columns of every view.
+    /// Columns of every view, before `half_size`.
     pub width: usize,
-    /// Rows of every view.
+    /// Rows of every view, before `half_size`.
     pub height: usize,
     /// Computation of the mean orientation of the contexts.
     pub pose_rotation: PoseRotation,
@@ -25,6 +25,22 @@ pub struct ClipOptions {
     pub pose_scale: PoseScale,
     /// Whether the principal point moves exactly with the crop; `false` in published results.
     pub exact_principal_point: bool,
+    /// Whether the fitted views are reduced to half as many columns and rows ([`Clip::at_half_resolution`]).
+    pub half_size: bool,
+}
+
+/// The paper's 256 x 256 pixels.
+impl Default for ClipOptions {
+    fn default() -> Self {
+        Self {
+            width: 256,
+            height: 256,
+            pose_rotation: PoseRotation::default(),
+            pose_scale: PoseScale::default(),
+            exact_principal_point: false,
+            half_size: false,
+        }
+    }
 }
 
 /// Reads clips from a source.
@@ -37,8 +53,8 @@ pub struct ClipReader {
 }
 
 impl ClipReader {
-    /// Reads each distinct frame of `views` once, fits the frames to the configured size, and normalises the poses by
-    /// the contexts.
+    /// Reads each distinct frame of `views` once, fits the frames to the configured size, normalises the poses by the
+    /// contexts, and reduces the views with `half_size`.
     ///
     /// # Errors
     /// [`DataError::NoSuchFrame`] for a position beyond the scene, [`DataError::InFrame`] around
@@ -78,20 +94,34 @@ impl ClipReader {
             cameras: frames.iter().map(camera).collect(),
             frame_index: frames.to_vec(),
         };
-        Ok(Clip { key: key.to_owned(), context: gather(&views.context), target: gather(&views.target) })
+        let num_pixels = self.options.width * self.options.height;
+        let weights = |frame: &usize| fitted[frame].2.clone().unwrap_or_else(|| vec![u8::MAX; num_pixels]);
+        let has_weights = views.target.iter().any(|frame| fitted[frame].2.is_some());
+        let clip = Clip {
+            key: key.to_owned(),
+            context: gather(&views.context),
+            target: gather(&views.target),
+            target_weights: has_weights.then(|| views.target.iter().flat_map(weights).collect()),
+        };
+        Ok(if self.options.half_size { clip.at_half_resolution() } else { clip })
     }
 
-    fn fitted(
-        &self,
-        scene: usize,
-        frame: usize,
-        intrinsics: IntrinsicsNorm,
-    ) -> Result<(RgbImage, Intrinsics), DataError> {
+    /// Returns the image, its intrinsics, and the weights of its pixels if some are left out.
+    fn fitted(&self, scene: usize, frame: usize, intrinsics: IntrinsicsNorm) -> Result<Fitted, DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
-        fit_image(&self.source.frame(scene, frame)?, intrinsics, width, height, exact_principal_point)
-            .map_err(DataError::in_frame(self.source.key(scene), frame))
+        let fit = |image: &RgbImage| {
+            fit_image(image, intrinsics, width, height, exact_principal_point)
+                .map_err(DataError::in_frame(self.source.key(scene), frame))
+        };
+        let (image, coverage) = self.source.frame_with_coverage(scene, frame)?;
+        let weights = coverage.map(|coverage| fit(&coverage)).transpose()?;
+        let weights = weights.map(|(coverage, _)| coverage.rgb.into_iter().step_by(3).collect());
+        let (image, intrinsics) = fit(&image)?;
+        Ok((image, intrinsics, weights))
     }
 }
+
+type Fitted = (RgbImage, Intrinsics, Option<Vec<u8>>);
 
 #[cfg(test)]
 mod tests {
@@ -101,13 +131,9 @@ mod tests {
     use clift_core::Pose;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
-    const OPTIONS: ClipOptions = ClipOptions {
-        width: 32,
-        height: 32,
-        pose_rotation: PoseRotation::Quaternion,
-        pose_scale: PoseScale::Context,
-        exact_principal_point: false,
-    };
+    fn options() -> ClipOptions {
+        ClipOptions { width: 32, height: 32, ..ClipOptions::default() }
+    }
 
     /// Returns a reader of the fixture's test scene with another pose of frame 4, and the count of decoded frames.
     fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<AtomicUsize>) {
@@ -131,7 +157,7 @@ mod tests {
 
     #[test]
     fn views_keep_their_order_and_frames_are_decoded_once() {
-        let (reader, num_decoded) = reader(None, OPTIONS);
+        let (reader, num_decoded) = reader(None, options());
         let clip = reader.read(0, &views(&[7, 0, 2], &[2, 2, 5])).unwrap();
         assert_eq!(num_decoded.load(Ordering::Relaxed), 4);
         assert_eq!((clip.key.as_str(), clip.context.num_views()), ("00000000000000b1", 3));
@@ -150,7 +176,7 @@ mod tests {
 
     #[test]
     fn contexts_reach_to_one_and_targets_lie_between() {
-        let (reader, _) = reader(None, OPTIONS);
+        let (reader, _) = reader(None, options());
         let clip = reader.read(0, &views(&[0, 7], &[3])).unwrap();
         let [first, last] = [0, 1].map(|view| clip.context.cameras[view].c2w.translation);
         assert!((first + last).abs().max_element() < 1e-6, "{first} {last}"); // f32 files
@@ -163,7 +189,7 @@ mod tests {
     #[test]
     fn non_finite_pose_names_scene_and_frame() {
         let broken = Pose { translation: [0.0, f64::NAN, 0.0].into(), ..Pose::IDENTITY };
-        let (reader, _) = reader(Some(broken), OPTIONS);
+        let (reader, _) = reader(Some(broken), options());
         let message = reader.read(0, &views(&[0, 7], &[3, 4])).unwrap_err().to_string();
         assert_eq!(message, "frame 4 of scene 00000000000000b1: bad camera: the pose holds NaN");
         assert!(reader.read(0, &views(&[0, 7], &[3])).is_ok());
@@ -172,7 +198,7 @@ mod tests {
     #[test]
     fn equal_centres_missing_frames_and_upscaling_are_errors() {
         let message = |context: &[usize], width: usize| {
-            let (reader, _) = reader(None, ClipOptions { width, ..OPTIONS });
+            let (reader, _) = reader(None, ClipOptions { width, ..options() });
             reader.read(0, &views(context, &[1])).unwrap_err().to_string()
         };
         assert!(message(&[2, 2], 32).starts_with("scene 00000000000000b1 has no baseline"), "{}", message(&[2, 2], 32));

@@ -15,7 +15,15 @@ impl Clip {
     // column. Its intrinsics stay, which is correct only for a principal point at the centre.
     #[must_use]
     pub fn flipped(&self) -> Self {
-        Self { key: self.key.clone(), context: flipped(&self.context), target: flipped(&self.target) }
+        let rows = |weights: &Vec<u8>| {
+            weights.chunks_exact(self.target.width.max(1)).flat_map(|row| row.iter().rev()).copied().collect()
+        };
+        Self {
+            key: self.key.clone(),
+            context: flipped(&self.context),
+            target: flipped(&self.target),
+            target_weights: self.target_weights.as_ref().map(rows),
+        }
     }
 }
 
@@ -45,7 +53,7 @@ mod tests {
     use crate::scene_source::SceneSource;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::{TestSource, rooms};
-    use clift_core::{PoseRotation, PoseScale, RgbImage};
+    use clift_core::{PoseRotation, RgbImage};
     use std::sync::Arc;
 
     fn mirrored(source: SyntheticSource) -> TestSource {
@@ -72,8 +80,8 @@ mod tests {
             width: size[0],
             height: size[1],
             pose_rotation: rotation,
-            pose_scale: PoseScale::Context,
             exact_principal_point: true,
+            ..ClipOptions::default()
         };
         let views = ViewIndices { context: vec![0, 3, 8], target: vec![5, 5] };
         ClipReader { source, options }.read(0, &views).unwrap()

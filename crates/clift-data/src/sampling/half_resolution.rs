@@ -9,24 +9,38 @@ impl Clip {
     /// rows, the last one is lost.
     #[must_use]
     pub fn at_half_resolution(&self) -> Self {
-        let Self { key, context, target } = self;
-        Self { key: key.clone(), context: at_half_resolution(context), target: at_half_resolution(target) }
+        let Self { key, context, target, target_weights } = self;
+        Self {
+            key: key.clone(),
+            context: at_half_resolution(context),
+            target: at_half_resolution(target),
+            target_weights: target_weights.as_ref().map(|weights| halved_planes(weights, target)),
+        }
     }
+}
+
+/// Halves images of the size of `views` with any number of channels.
+fn halved_planes(pixels: &[u8], views: &ClipViews) -> Vec<u8> {
+    let num_pixels = views.width * views.height * views.num_views();
+    let num_channels = pixels.len() / num_pixels.max(1);
+    let (width, row_bytes) = (views.width / 2, num_channels * views.width);
+    let mut halved = Vec::with_capacity(pixels.len() / 4);
+    for image in pixels.chunks_exact((row_bytes * views.height).max(1)) {
+        for rows in image.chunks_exact(2 * row_bytes) {
+            let (upper, lower) = rows.split_at(row_bytes);
+            for at in (0..width).flat_map(|column| (0..num_channels).map(move |i| 2 * num_channels * column + i)) {
+                let right = at + num_channels;
+                let sum: u16 = [upper[at], upper[right], lower[at], lower[right]].map(u16::from).iter().sum();
+                halved.push(((sum + 2) / 4) as u8);
+            }
+        }
+    }
+    halved
 }
 
 fn at_half_resolution(views: &ClipViews) -> ClipViews {
     let (width, height) = (views.width / 2, views.height / 2);
-    let row_bytes = 3 * views.width;
-    let mut images = Vec::with_capacity(3 * width * height * views.num_views());
-    for image in views.images.chunks_exact((row_bytes * views.height).max(1)) {
-        for rows in image.chunks_exact(2 * row_bytes) {
-            let (upper, lower) = rows.split_at(row_bytes);
-            for at in (0..width).flat_map(|column| (0..3).map(move |channel| 6 * column + channel)) {
-                let sum: u16 = [upper[at], upper[at + 3], lower[at], lower[at + 3]].map(u16::from).iter().sum();
-                images.push(((sum + 2) / 4) as u8);
-            }
-        }
-    }
+    let images = halved_planes(&views.images, views);
     let halved = |camera: &Camera| Camera {
         intrinsics: Intrinsics::from(camera.intrinsics.to_array().map(|pixels| pixels / 2.0)),
         ..*camera
@@ -59,8 +73,8 @@ mod tests {
             cameras: vec![Camera { c2w: Pose::IDENTITY, intrinsics: k }; 2],
             frame_index: vec![4, 2],
         };
-        let clip = Clip { key: "room".into(), context: views.clone(), target: views };
-        let Clip { key, context, target } = clip.at_half_resolution();
+        let clip = Clip { key: "room".into(), context: views.clone(), target: views, target_weights: None };
+        let Clip { key, context, target, .. } = clip.at_half_resolution();
         assert_eq!((key.as_str(), context.width, context.height), ("room", 2, 1));
         // The mean of 0, 4, 20 and 24 is 12.
         assert_eq!(context.images, [12, 13, 14, 20, 21, 22, 112, 113, 114, 120, 121, 122]);

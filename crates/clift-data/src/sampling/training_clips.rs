@@ -1,15 +1,13 @@
 //! The training batch of a step: clips and skipped scenes.
 
-use std::sync::Arc;
-
 use clift_core::{item_rng, uniform_01};
 
 use crate::error::DataError;
-use crate::sampling::clip::{Clip, ViewIndices};
+use crate::sampling::clip::Clip;
+use crate::sampling::clip_reader::ClipReader;
 use crate::sampling::scene_order::SceneOrder;
 use crate::sampling::slot_filler::{NoUsableScene, SlotFiller};
 use crate::sampling::view_sampler::ViewSampler;
-use crate::scene_source::SceneSource;
 use crate::skip_report::SkippedScene;
 
 /// Smallest number of attempts of one slot before the batch fails, repeated scenes included.
@@ -19,15 +17,11 @@ const MIN_SCENES_TRIED: usize = 64;
 /// Bounds the search in a scene order that never reaches some scenes; 64 different scenes take about 300 steps.
 const MAX_STEPS_AHEAD: u32 = 4096;
 
-/// Reads the given frames of a scene as a clip.
-pub type ReadClip = dyn Fn(usize, &ViewIndices) -> Result<Clip, DataError> + Send + Sync;
-
 /// Reads the batch of any step as a pure function of (seed, step): scenes, views, and replacements of unusable scenes.
 ///
 /// A [`Prefetcher`](crate::sampling::prefetcher::Prefetcher) around it reads batches ahead.
 pub struct TrainingClips {
-    source: Arc<dyn SceneSource>,
-    read: Arc<ReadClip>,
+    reader: ClipReader,
     sampler: ViewSampler,
     order: SceneOrder,
     seed: u64,
@@ -35,23 +29,17 @@ pub struct TrainingClips {
 }
 
 impl TrainingClips {
-    /// Prepares batches of `batch_size` clips of the scenes of `source`, read by `read`.
+    /// Prepares batches of `batch_size` clips of the scenes of `reader`.
     ///
     /// `seed` determines all random values. Each stage of a run needs its own seed
     /// ([`derive_seed`](clift_core::derive_seed)).
     ///
     /// # Errors
     /// [`DataError::BadConfig`] for an invalid sampler, a source without scenes and a `batch_size` of 0.
-    pub fn new(
-        source: Arc<dyn SceneSource>,
-        read: Arc<ReadClip>,
-        sampler: ViewSampler,
-        batch_size: usize,
-        seed: u64,
-    ) -> Result<Self, DataError> {
+    pub fn new(reader: ClipReader, sampler: ViewSampler, batch_size: usize, seed: u64) -> Result<Self, DataError> {
         sampler.validate()?;
-        let order = SceneOrder::new(seed, source.num_scenes(), batch_size)?;
-        Ok(Self { source, read, sampler, order, seed, flip: false })
+        let order = SceneOrder::new(seed, reader.source.num_scenes(), batch_size)?;
+        Ok(Self { reader, sampler, order, seed, flip: false })
     }
 
     /// With `true`, mirrors each clip with probability 1/2 ([`Clip::flipped`]).
@@ -69,15 +57,15 @@ impl TrainingClips {
     /// [`DataError::NoUsableScene`] after 16 attempts and 64 different scenes (all scenes of a smaller source).
     pub fn slot(&self, step: u64, slot: usize, skipped: &mut Vec<SkippedScene>) -> Result<Clip, DataError> {
         let num_context = self.sampler.num_context(self.seed, step);
+        let source = &self.reader.source;
         let filler = SlotFiller {
             min_attempts: MIN_ATTEMPTS,
-            min_scenes: self.source.num_scenes().min(MIN_SCENES_TRIED),
+            min_scenes: source.num_scenes().min(MIN_SCENES_TRIED),
             max_attempts: MAX_STEPS_AHEAD,
         };
         let scene = |ahead: u32| self.order.scene(step.saturating_add(u64::from(ahead)), slot);
         let read = |scene: usize, ahead: u32| {
-            let skip =
-                |error: DataError| SkippedScene { key: self.source.key(scene).into(), reason: error.to_string() };
+            let skip = |error: DataError| SkippedScene { key: source.key(scene).into(), reason: error.to_string() };
             self.read_scene(scene, step, slot, ahead, num_context).map_err(skip)
         };
         filler.fill(scene, read, skipped).map_err(|NoUsableScene { attempts, last: SkippedScene { key, reason } }| {
@@ -94,8 +82,8 @@ impl TrainingClips {
         num_context: usize,
     ) -> Result<Clip, DataError> {
         let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
-        let views = self.sampler.sample(self.source.as_ref(), scene, step, num_context, &mut rng)?;
-        let clip = (self.read)(scene, &views)?;
+        let views = self.sampler.sample(self.reader.source.as_ref(), scene, step, num_context, &mut rng)?;
+        let clip = self.reader.read(scene, &views)?;
         // A separate stream: the sampled views do not depend on `flip`.
         let is_flipped = self.flip && uniform_01(&mut item_rng(self.seed, step, slot as u32, attempt, "flip")) < 0.5;
         Ok(if is_flipped { clip.flipped() } else { clip })
@@ -105,27 +93,14 @@ impl TrainingClips {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sampling::clip_reader::ClipOptions;
     use crate::testing::Lengths;
-    use clift_core::{Camera, ClipViews, Intrinsics, Pose};
+    use std::sync::Arc;
 
     fn clips(lengths: Vec<usize>, batch_size: usize, seed: u64) -> TrainingClips {
-        let source = Arc::new(Lengths::new(lengths));
-        let keys = source.keys.clone();
-        let camera = Camera {
-            c2w: Pose { translation: [1.0, 0.0, 0.0].into(), ..Pose::IDENTITY },
-            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 },
-        };
-        let read = move |scene: usize, views: &ViewIndices| {
-            let only = |frame_index: &[usize]| ClipViews {
-                width: 0,
-                height: 0,
-                images: Vec::new(),
-                cameras: vec![camera; frame_index.len()],
-                frame_index: frame_index.to_vec(),
-            };
-            Ok(Clip { key: keys[scene].clone(), context: only(&views.context), target: only(&views.target) })
-        };
-        TrainingClips::new(source, Arc::new(read), ViewSampler::default(), batch_size, seed).unwrap()
+        let options = ClipOptions { width: 1, height: 1, ..ClipOptions::default() };
+        let reader = ClipReader { source: Arc::new(Lengths::new(lengths)), options };
+        TrainingClips::new(reader, ViewSampler::default(), batch_size, seed).unwrap()
     }
 
     fn batch(clips: &TrainingClips, step: u64) -> Result<(Vec<Clip>, Vec<SkippedScene>), DataError> {
@@ -145,8 +120,8 @@ mod tests {
         let rare = (0..300).map(|scene| if scene % 23 == 5 { 90 } else { 10 + scene % 17 }).collect();
         for (clips, expected) in [(mixed().with_flip(true), 0xd652_d9cf), (clips(rare, 8, 12345), 0x1fc9_670d)] {
             let line = |step: u64, (clips, skipped): (Vec<Clip>, Vec<SkippedScene>)| {
-                let clips = clips.iter().map(|Clip { key, context, target }| {
-                    (key, &context.frame_index, &target.frame_index, context.cameras[0].c2w.translation[0])
+                let clips = clips.iter().map(|Clip { key, context, target, .. }| {
+                    (key, &context.frame_index, &target.frame_index, context.cameras[0].c2w.translation[0].signum())
                 });
                 let skips = skipped.iter().map(|skip| (&skip.key, &skip.reason));
                 format!("{step} {:?} {:?}", clips.collect::<Vec<_>>(), skips.collect::<Vec<_>>())

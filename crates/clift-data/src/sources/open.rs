@@ -28,9 +28,6 @@ const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
 /// Smallest number of chunks with a chunk index cache; fewer are read in a second.
 const MIN_CACHED_CHUNKS: usize = 100;
 
-/// Largest number of chunks that are read at opening even without filters, so that what is odd in them is reported.
-const MAX_READ_CHUNKS: usize = 8;
-
 /// An open data set.
 pub struct OpenedSource {
     /// Scenes of the data set.
@@ -123,7 +120,7 @@ impl SplitFolder<'_> {
         let caches = cache_folder().filter(|_| num_chunks >= MIN_CACHED_CHUNKS);
         let cache = caches.map(|caches| ChunkIndexCache::path(&caches, &self.base));
         let cache = cache.as_deref().map(|path| (path, progress));
-        let (filters, reads_all) = (&options.filters, options.reads_chunks || num_chunks <= MAX_READ_CHUNKS);
+        let (filters, reads_all) = (&options.filters, options.reads_chunks);
         let mut source = ChunkSource::of_index(&self.base, &index, is_kept, filters, reads_all, cache)?;
         if kind == SourceKind::Chunks {
             source.record_unlisted(&self.base, &index);
@@ -153,6 +150,7 @@ impl SplitFolder<'_> {
                 min_size: options.min_size,
                 poses_from: files.poses_from,
                 undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
+                background: options.background,
             },
             filters: options.filters.clone(),
             whole_scenes: (is_dl3dv || kind == SourceKind::Re10kTxt) && !files.keep_incomplete,

@@ -38,6 +38,8 @@ pub struct SourceOptions {
     pub filters: SceneFilters,
     /// Paths of the parts of the layout.
     pub files: FileOptions,
+    /// Colour of masked and transparent pixels.
+    pub background: [u8; 3],
     /// Smallest columns and rows of an image; for layouts with one file per frame.
     pub min_size: [usize; 2],
     /// Cache of large photos at `min_size`; `None` decodes them at every use.

@@ -111,6 +111,10 @@ impl SceneSource for SceneSubset {
         self.source.frame(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }
 
+    fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
+        self.source.frame_with_coverage(self.scenes[scene], self.frame_in_source(scene, frame)?)
+    }
+
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         self.source.encoded_frame(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }

@@ -79,15 +79,23 @@ fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {
 fn colmap_lenses_are_undistorted_unless_ignored() {
     // The camera has twice the size of the images.
     let norm = |fx: f64, fy: f64| IntrinsicsNorm { fx: fx / 64.0, fy: fy / 36.0, cx: 31.0 / 64.0, cy: 19.0 / 36.0 };
-    for (line, fx, fy, radial, tangential) in [
-        ("SIMPLE_PINHOLE 64 36 56 31 19", 56.0, 56.0, [0.0; 2], [0.0; 2]),
-        ("PINHOLE 64 36 56 57 31 19", 56.0, 57.0, [0.0; 2], [0.0; 2]),
-        ("SIMPLE_RADIAL 64 36 56 31 19 0.1", 56.0, 56.0, [0.1, 0.0], [0.0; 2]),
-        ("RADIAL 64 36 56 31 19 0.1 -0.03", 56.0, 56.0, [0.1, -0.03], [0.0; 2]),
-        ("OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001", 56.0, 57.0, [0.1, -0.03], [0.002, -0.001]),
+    for (line, fx, fy, num_distortion) in [
+        ("SIMPLE_PINHOLE 64 36 56 31 19", 56.0, 56.0, 0),
+        ("pinhole 64 36 56 57 31 19", 56.0, 57.0, 0),
+        ("SIMPLE_RADIAL 64 36 56 31 19 0.1", 56.0, 56.0, 1),
+        ("RADIAL 64 36 56 31 19 0.1 -0.03", 56.0, 56.0, 2),
+        ("OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001", 56.0, 57.0, 4),
+        ("OPENCV 64 36 56 57 31 19 0.1 -0.03", 56.0, 57.0, 2),
+        ("FULL_OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001 0.01 0.05 0.01 0.02", 56.0, 57.0, 8),
     ] {
         let (root, image) = colmap(line);
-        let (norm, lens) = (norm(fx, fy), Lens { radial: [radial[0], radial[1], 0.0], tangential });
+        let words: Vec<&str> = line.split(' ').collect();
+        let mut params: Vec<f64> =
+            words[words.len() - num_distortion..].iter().map(|word| word.parse().unwrap()).collect();
+        if (words[0], num_distortion) == ("OPENCV", 2) {
+            params.extend([0.0; 2]);
+        }
+        let (norm, lens) = (norm(fx, fy), Lens::from_colmap(words[0], &params).unwrap());
         let ignored = open(root.path(), Some(false));
         assert_eq!(ignored.cameras(0).unwrap()[0].intrinsics, norm, "{line}");
         assert_eq!(ignored.frame(0, 0).unwrap(), image, "{line}");
@@ -101,6 +109,54 @@ fn colmap_lenses_are_undistorted_unless_ignored() {
         assert_eq!(source.frame(0, 0).unwrap(), undistortion.apply(&image), "{line}");
         assert_ne!(source.frame(0, 0).unwrap(), image, "{line}");
         assert_eq!(source.encoded_frame(0, 0).unwrap(), None, "no file holds the resampled image");
+    }
+}
+
+#[test]
+fn fisheye_images_are_cut_with_a_note_and_never_taken_for_pinhole_images() {
+    // 180 degrees across 64 columns.
+    let (root, image) = colmap("OPENCV_FISHEYE 64 36 20.4 20.4 31 19 0 0 0 0");
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
+    assert_ne!(source.frame(0, 0).unwrap(), image);
+    assert!(report.to_string().contains("cut to the part of the lens that a pinhole camera can show"), "{report}");
+    let k = source.cameras(0).unwrap()[0].intrinsics;
+    assert!((((1.0 - k.cx) / k.fx).atan().to_degrees() - 60.0).abs() < 1e-9, "{k:?}");
+    let options = FileOptions { undistort: Some(false), ..FileOptions::default() };
+    let message = open_with(root.path(), options).map(|_| ()).unwrap_err();
+    assert!(message.contains("set data.files.undistort to true"), "{message}");
+}
+
+#[test]
+fn lenses_of_transforms_json_are_those_of_nerfstudio() {
+    let colmap = |model: &str, params: &[f64]| Lens::from_colmap(model, params).unwrap();
+    let polynomial = Lens { radial: [0.1, -0.02, 0.01, 1e-9, 0.0, 0.0], tangential: [0.002, 0.001], ..Lens::default() };
+    let aria = [0.01, 0.02, 0.0, 0.0, 0.0, 0.0, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0];
+    for (keys, lens) in [
+        (json!({"k1": 0.1, "k2": -0.02, "k3": 0.01, "k4": 1e-9, "p1": 0.002, "p2": 0.001}), polynomial),
+        (json!({"camera_model": "opencv", "distortion_params": [0.1, -0.02, 0.01, 1e-9, 0.002, 0.001]}), polynomial),
+        (json!({"is_fisheye": true, "k1": 0.05, "k2": 0.01}), colmap("RADIAL_FISHEYE", &[0.05, 0.01])),
+        (
+            json!({"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k4": 0.01}),
+            colmap("OPENCV_FISHEYE", &[0.05, 0.0, 0.0, 0.01]),
+        ),
+        (json!({"camera_model": "simple_radial_fisheye", "k1": 0.05}), colmap("SIMPLE_RADIAL_FISHEYE", &[0.05])),
+        (json!({"camera_model": "FOV", "omega": 0.9}), colmap("FOV", &[0.9])),
+        (
+            json!({"camera_model": "FULL_OPENCV", "k1": 0.1, "k4": 0.05, "k6": 0.01}),
+            colmap("FULL_OPENCV", &[0.1, 0.0, 0.0, 0.0, 0.0, 0.05, 0.0, 0.01]),
+        ),
+        (
+            json!({"camera_model": "THIN_PRISM_FISHEYE", "k1": 0.05, "p1": 0.002, "sx1": 0.01, "sy1": 0.003}),
+            colmap("THIN_PRISM_FISHEYE", &[0.05, 0.0, 0.002, 0.0, 0.0, 0.0, 0.01, 0.003]),
+        ),
+        (json!({"camera_model": "FISHEYE624", "distortion_params": aria}), colmap("RAD_TAN_THIN_PRISM_FISHEYE", &aria)),
+    ] {
+        let mut transforms = json!({"fl_x": 24, "w": 24, "h": 16, "frames": [frame_at(0.0, "r_0.png")]});
+        transforms.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
+        let (_root, opened) = capture(&["r_0.png"], &transforms);
+        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.5, cx: 0.5, cy: 0.5 };
+        let expected = Undistortion::new(norm, lens).unwrap().intrinsics_norm();
+        assert_eq!(opened.source.cameras(0).unwrap()[0].intrinsics, expected, "{keys}");
     }
 }
 

@@ -52,9 +52,13 @@ fn errors_of_transforms_json_are_named() {
         ("\"fl_x\": 28.0", "\"fl_x\": NaN", "fx is NaN, expected a positive number"),
         ("\"fl_x\": 28.0", "\"fl_x\": 1e999", "number out of range"),
         ("\"w\": 32", "\"w\": 0", "w is 0, expected a number of pixels"),
-        ("\"OPENCV\"", "\"OPENCV_FISHEYE\"", "camera_model is OPENCV_FISHEYE, expected one of PINHOLE, "),
-        ("\"fl_x\"", "\"is_fisheye\": true, \"fl_x\"", "camera_model is OPENCV_FISHEYE"),
-        ("\"fl_x\"", "\"k4\": 0.1, \"fl_x\"", "k4 is 0.1, expected 0: lenses have"),
+        ("\"OPENCV\"", "\"EQUIRECTANGULAR\"", "camera_model is EQUIRECTANGULAR, expected one of OPENCV, PINHOLE, "),
+        ("\"OPENCV\"", "\"FOV\"", "expected omega of the FOV camera"),
+        (
+            "\"fl_x\"",
+            "\"distortion_params\": [0.1], \"fl_x\"",
+            "distortion_params has 1 numbers, expected 4 or 6 for OPENCV",
+        ),
         ("\"fl_x\"", "\"k1\": -9.5, \"fl_x\"", "cannot be undone at the edge of the image"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0, 1.0]", "transform_matrix ends in [0.0, 0.0, 1.0, 1.0]"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]", "a list of more than 4 items"),
@@ -176,7 +180,7 @@ fn errors_of_colmap_models_are_named() {
     }
     for (file, from, to, expected) in [
         (0, "7 PINHOLE", "7 FULL_OPENCV", "camera 7: FULL_OPENCV has 4 parameters, expected 12"),
-        (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected SIMPLE_PINHOLE"),
+        (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected one of SIMPLE_PINHOLE, "),
         (0, "PINHOLE 32", "PINHOLE -32", "line 4: WIDTH is \"-32\", expected a number"),
         (0, "PINHOLE 32 18", "PINHOLE 32 0", "camera 7: the size is 32x0 pixels"),
         (0, "32 18 28", "32 18 nan", "camera 7: bad camera: fx is NaN"),

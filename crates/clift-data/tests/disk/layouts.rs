@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use clift_core::{PoseRotation, PoseScale};
 use clift_data::{
     Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, SceneFilters, SceneSource, SourceInfo, SourceKind,
     SourceOptions, Split, ViewIndices,
@@ -33,13 +32,7 @@ fn open_kind(root: &Path, split: Split, kind: SourceKind) -> OpenedSource {
 }
 
 fn clip(source: Arc<dyn SceneSource>) -> Clip {
-    let options = ClipOptions {
-        width: 16,
-        height: 16,
-        pose_rotation: PoseRotation::Quaternion,
-        pose_scale: PoseScale::Context,
-        exact_principal_point: true,
-    };
+    let options = ClipOptions { width: 16, height: 16, exact_principal_point: true, ..ClipOptions::default() };
     let views = ViewIndices { context: vec![0, 2, 5], target: vec![1, 3, 4] };
     ClipReader { source, options }.read(0, &views).unwrap()
 }

@@ -6,6 +6,7 @@ mod files;
 mod hostile;
 mod layouts;
 mod lenses;
+mod masks;
 mod skipped;
 
 use std::path::Path;

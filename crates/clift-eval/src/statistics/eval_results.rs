@@ -56,6 +56,8 @@ pub struct EvalResults {
     pub(crate) context_check: Option<ContextCheck>,
     /// Keys of the scenes that the models were trained on.
     pub(crate) training_scenes: BTreeSet<String>,
+    /// Share of the pixels that masks leave out, of targets with a mask, by scene and frame.
+    pub(crate) masked: BTreeMap<String, BTreeMap<usize, f64>>,
 }
 
 impl EvalResults {
@@ -100,6 +102,7 @@ impl EvalResults {
         if let Some(check) = other.context_check {
             self.add_context_check(check);
         }
+        self.masked.extend(other.masked);
     }
 
     /// Iterates over the views of every key, in the order of keys.

@@ -128,6 +128,8 @@ pub struct Summary {
     pub context_check: Option<ContextCheck>,
     /// Scenes that the models were trained on.
     pub training_scenes: BTreeSet<String>,
+    /// Share of the target pixels that masks leave out of the metrics; `null` without masks.
+    pub masked_share: Option<f64>,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
     /// SHA-256 of the LPIPS weights.
@@ -165,6 +167,7 @@ impl Summary {
             .map(|(key, views)| SummaryPoint::new(results, key, views))
             .collect();
         mark_fronts(&mut points);
+        let masked: f64 = results.masked.values().flat_map(BTreeMap::values).sum();
         Self {
             num_scenes: scenes.len(),
             num_views: views.len(),
@@ -174,6 +177,7 @@ impl Summary {
             context_frames: results.context_frames.clone(),
             context_check: results.context_check,
             training_scenes: results.training_scenes.clone(),
+            masked_share: (!results.masked.is_empty()).then(|| masked / views.len().max(1) as f64),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
@@ -365,6 +369,7 @@ mod tests {
         views.context_frames.insert("a".into(), vec![0, 4]);
         views.add_context_check(ContextCheck { num_views: 2, num_fog: 1 });
         views.training_scenes.insert("a".into());
+        views.masked.insert("a".into(), [(0, 0.25)].into());
         let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
@@ -387,6 +392,7 @@ mod tests {
             "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
             "context_frames": {"a": [0, 4]}, "context_check": {"num_views": 2, "num_fog": 1},
             "training_scenes": ["a"],
+            "masked_share": 0.25,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],

@@ -44,7 +44,7 @@ pub fn evaluate_scene(
     let device = &models.stage1.device;
     let context = Views::upload(&[&clip.context], device)?;
     let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
-    let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
+    let scorer = ViewScorer::new(clip, sweep.lpips.as_ref());
     let renderer = TargetRenderer { clip, scorer: &scorer, cameras: Cameras::upload(&[&clip.target], device)?, sweep };
     let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
     for rendering in &results.renderings {
@@ -55,6 +55,11 @@ pub fn evaluate_scene(
     metrics.context_frames.insert(clip.key.clone(), clip.context.frame_index.clone());
     if sweep.checks_contexts {
         metrics.add_context_check(check_contexts(models, &context, clip)?);
+    }
+    for (view, &frame) in clip.target.frame_index.iter().enumerate() {
+        if let Some((_, share)) = scorer.weights(view) {
+            metrics.masked.entry(clip.key.clone()).or_default().insert(frame, 1.0 - share);
+        }
     }
     let mut jobs = Vec::new();
     if models.supports_clusters() {

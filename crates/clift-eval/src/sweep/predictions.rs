@@ -122,7 +122,7 @@ mod tests {
 
     fn clip() -> Clip {
         let views = |frames: &[usize]| gray_views((24, 16), 100, vec![Pose::IDENTITY; frames.len()], frames.to_vec());
-        Clip { key: "a/room".into(), context: views(&[0]), target: views(&[3, 12, 40]) }
+        Clip { key: "a/room".into(), context: views(&[0]), target: views(&[3, 12, 40]), target_weights: None }
     }
 
     fn external(folder: &Path) -> ExternalMethod {
@@ -141,7 +141,7 @@ mod tests {
         write(folder.path(), "a_room/000003.png", 100, (24, 16));
         write(folder.path(), "a_room/color/000040.png", 151, (24, 16));
         let (clip, mut into) = (clip(), EvalResults::default());
-        let scorer = ViewScorer::new(&clip.target, None);
+        let scorer = ViewScorer::new(&clip, None);
         let scored = external(folder.path()).score(&clip, &scorer, &[2], &mut into).unwrap();
         assert_eq!(scored.metrics.keys().copied().collect::<Vec<_>>(), [0, 2]);
         assert_eq!(scored.metrics[&0].psnr, f64::INFINITY);

@@ -68,7 +68,12 @@ mod tests {
     }
 
     fn clip(targets: &[f64], frame_index: &[usize]) -> Clip {
-        Clip { key: "room".into(), context: views(&[-1.0, 1.0], &[0, 9]), target: views(targets, frame_index) }
+        Clip {
+            key: "room".into(),
+            context: views(&[-1.0, 1.0], &[0, 9]),
+            target: views(targets, frame_index),
+            target_weights: None,
+        }
     }
 
     fn tokens(selection: Selection, clip: &Clip, count: usize) -> Vec<Vec<u32>> {

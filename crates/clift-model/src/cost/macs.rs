@@ -158,7 +158,7 @@ mod tests {
     use burn::tensor::{DType, Device, Tensor};
 
     use super::*;
-    use crate::network::model::Clift;
+    use crate::network::model::Network;
     use crate::network::tokens::Tokens;
     use crate::ops::mac_counter;
     use crate::testing::{random, small_configs};
@@ -180,7 +180,7 @@ mod tests {
     fn macs_equal_those_counted_in_a_forward_pass() {
         let device = Device::flex();
         for config in small_configs() {
-            let model = Clift::new(&config, 0, &device);
+            let model = Network::new(&config, 0, &device);
             for (num_views, [height, width], stored) in [(2, [16, 24], 5), (3, [8, 16], 1), (2, [24, 8], 6)] {
                 let cameras = |views: usize| Cameras {
                     height,

@@ -224,7 +224,7 @@ mod tests {
 
     use super::*;
     use crate::cost::parameters::Parameters;
-    use crate::network::model::Clift;
+    use crate::network::model::Network;
     use crate::testing::small_configs;
     use crate::weights::file::save_weights;
 
@@ -233,7 +233,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let path = folder.path().join("model.safetensors");
         for config in small_configs() {
-            let model = Clift::new(&config, 0, &Device::flex());
+            let model = Network::new(&config, 0, &Device::flex());
             save_weights(&model, &path).expect("writes");
             let bytes = std::fs::read(&path).expect("reads");
             let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid");

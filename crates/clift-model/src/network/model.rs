@@ -18,7 +18,7 @@ use crate::views::upload::{Cameras, Views};
 
 /// Encoder, token norm, condenser and renderer. Stage 1 trains encoder and renderer, stage 2 condenser and renderer.
 #[derive(Module, Debug)]
-pub struct Clift {
+pub struct Network {
     /// Context views to light-field tokens.
     pub encoder: Encoder,
     /// Norm of the encoder's tokens, of variants that have one. Both stages train it.
@@ -29,7 +29,7 @@ pub struct Clift {
     pub renderer: Renderer,
 }
 
-impl Clift {
+impl Network {
     /// Makes a model with random weights, which depend on the seed and not on the device.
     pub fn new(config: &ModelConfig, seed: u64, device: &Device) -> Self {
         let mut init = Init::of(config, seed, device);
@@ -141,7 +141,7 @@ mod tests {
     }
 
     fn forward(fixture: &Fixture, config: &ModelConfig, device: &Device) -> ForwardPass {
-        let Clift { encoder, renderer, .. } = Clift::new(config, 0, device);
+        let Network { encoder, renderer, .. } = Network::new(config, 0, device);
         let encoder = load_weights(encoder, fixture, "weight.encoder.");
         let renderer = load_weights(renderer, fixture, "weight.renderer.");
         let cameras = |kind: &str| Cameras {

@@ -4,17 +4,17 @@
 use burn::tensor::Tensor;
 
 use crate::network::camera_encoding::TokenTransforms;
-use crate::network::model::Clift;
+use crate::network::model::Network;
 use crate::network::render_tokens::{KeyValueCache, RenderTokens};
 use crate::network::tokens::Tokens;
 use crate::views::upload::{Cameras, Views};
 
 /// Compresses or selects the tokens of the renderer from the encoder's tokens.
-pub type TokenStep<'a, E> = &'a dyn Fn(&Clift, Tokens) -> Result<RenderTokens, E>;
+pub type TokenStep<'a, E> = &'a dyn Fn(&Network, Tokens) -> Result<RenderTokens, E>;
 
 /// The forward pass of a batch of scenes.
 pub struct Pass<'a, E> {
-    model: &'a Clift,
+    model: &'a Network,
     context: &'a Views,
     targets: &'a Cameras,
     token_step: TokenStep<'a, E>,
@@ -33,7 +33,7 @@ pub struct PassState {
 
 impl<'a, E> Pass<'a, E> {
     /// Describes the pass of `model` from `context` to images of `targets`.
-    pub fn new(model: &'a Clift, context: &'a Views, targets: &'a Cameras, token_step: TokenStep<'a, E>) -> Self {
+    pub fn new(model: &'a Network, context: &'a Views, targets: &'a Cameras, token_step: TokenStep<'a, E>) -> Self {
         let context_transforms = model.encoder.blocks().transforms(&context.cameras);
         let target_transforms = model.renderer.blocks().transforms(targets);
         Self { model, context, targets, token_step, context_transforms, target_transforms }

@@ -21,8 +21,7 @@
 //! - `precision`: f32, bf16 or f16 operands of matrix products, per scope
 //! - `mac_counter`: multiply-accumulates, counted in tests
 //!
-//! CPU kernels on slices are in the crate `clift-kernels`. GPU kernels go into a crate beside it, `clift-cube`, on tensors of
-//! `CubeCL`; `backends/cube.rs` calls them. Today `CubeCL`'s own matrix product is all that it calls.
+//! CPU kernels on slices are in the crate `clift-kernels`, GPU kernels on buffers of `CubeCL` in the crate `clift-cube`.
 
 pub(crate) mod attention;
 pub(crate) mod autodiff;

@@ -244,15 +244,15 @@ mod tests {
 
     use super::*;
     use crate::network::architecture::CliftVariant;
-    use crate::network::model::Clift;
+    use crate::network::model::Network;
     use crate::testing::small_config;
     use crate::weights::hash::weights_hash;
 
-    fn model(seed: u64) -> Clift {
-        Clift::new(&small_config(CliftVariant::Paper), seed, &Device::flex())
+    fn model(seed: u64) -> Network {
+        Network::new(&small_config(CliftVariant::Paper), seed, &Device::flex())
     }
 
-    fn load(module: &mut Clift, path: &Path) -> Result<LoadReport, ModelError> {
+    fn load(module: &mut Network, path: &Path) -> Result<LoadReport, ModelError> {
         load_part(module, &PathFilter::all(), path)
     }
 
@@ -293,7 +293,7 @@ mod tests {
 
         let mut read = model(2);
         load(&mut read, &half).unwrap().require_all(&half).unwrap();
-        let values = |module: &Clift| {
+        let values = |module: &Network| {
             let mut values = Vec::new();
             visit(module, |_, _, data| values.extend(data.iter::<f32>()));
             values
@@ -329,7 +329,7 @@ mod tests {
         save_weights(&model(1), &path).expect("writes");
         let mut config = small_config(CliftVariant::Paper);
         config.feed_forward_dim = 20;
-        let mut narrow = Clift::new(&config, 0, &Device::flex());
+        let mut narrow = Network::new(&config, 0, &Device::flex());
         let message = load(&mut narrow, &path).unwrap_err().to_string();
         let shapes =
             ["bias is [22], expected [20]", "is [22, 15], expected [20, 15]", "is [15, 22], expected [15, 20]"];

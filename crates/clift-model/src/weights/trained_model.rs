@@ -10,7 +10,7 @@ use crate::cost::parameters::Parameters;
 use crate::error::ModelError;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
-use crate::network::model::{Clift, is_condenser};
+use crate::network::model::{Network, is_condenser};
 use crate::network::parts::renderer::Renderer;
 use crate::weights::file::{load_module, load_part};
 use crate::weights::hash::{renderer_hash, weights_hash};
@@ -22,7 +22,7 @@ pub struct TrainedModel {
     /// Sizes and variant of the network.
     pub config: ModelConfig,
     /// The network. Its condenser is untrained if `has_condenser` is false.
-    pub network: Clift,
+    pub network: Network,
     /// Whether the condenser is trained, as it is after stage 2.
     pub has_condenser: bool,
     /// The device of the weights.
@@ -46,7 +46,7 @@ impl TrainedModel {
     /// [`ModelError::Weights`] for a file that cannot be read or has other names or shapes.
     pub fn open_with(path: &ModelPath, config: &ModelConfig, device: &Device) -> Result<Self, ModelError> {
         check_sizes(config, &path.dir)?;
-        let mut network = Clift::new(config, 0, device);
+        let mut network = Network::new(config, 0, device);
         let mut loaded = load_part(&mut network, &PathFilter::all(), &path.weights)?;
         let has_condenser = loaded.applied.iter().any(|name| is_condenser(name));
         if has_condenser {
@@ -59,7 +59,7 @@ impl TrainedModel {
     }
 
     /// Copies a network during training; `network` is on a device without autodiff.
-    pub fn snapshot(network: &Clift, config: &ModelConfig, has_condenser: bool) -> Self {
+    pub fn snapshot(network: &Network, config: &ModelConfig, has_condenser: bool) -> Self {
         let device = network.devices().into_iter().next().unwrap_or_default();
         Self { config: config.clone(), network: network.clone(), has_condenser, device }
     }
@@ -113,25 +113,25 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let device = Device::flex();
         let config = small_config(CliftVariant::Paper);
-        let network = Clift::new(&config, 3, &device);
+        let network = Network::new(&config, 3, &device);
         let path = |name: &str| ModelPath { dir: folder.path().into(), weights: folder.path().join(name) };
         let [stage1, stage2] = ["stage1", "stage2"].map(path);
-        save_part(&network, &Clift::stage1_part(), &stage1.weights).unwrap();
+        save_part(&network, &Network::stage1_part(), &stage1.weights).unwrap();
         save_weights(&network, &stage2.weights).unwrap();
         let models = [&stage1, &stage2].map(|path| TrainedModel::open_with(path, &config, &device).unwrap());
         assert_eq!([0, 1].map(|i| models[i].has_condenser), [false, true]);
         assert!(models[0].has_encoder_of(&models[1]));
         assert_eq!(weights_hash(&models[1].network), weights_hash(&network));
-        let other = TrainedModel::snapshot(&Clift::new(&config, 4, &device), &config, false);
+        let other = TrainedModel::snapshot(&Network::new(&config, 4, &device), &config, false);
         assert!(!other.has_encoder_of(&models[0]));
 
         // A part of a file is read without the rest, which is unused; the condenser keeps its values.
-        let mut read = Clift::new(&config, 5, &device);
+        let mut read = Network::new(&config, 5, &device);
         let condenser = weights_hash(&read.condenser);
-        let loaded = load_part(&mut read, &Clift::stage1_part(), &stage2.weights).unwrap();
+        let loaded = load_part(&mut read, &Network::stage1_part(), &stage2.weights).unwrap();
         assert!(loaded.missing.is_empty() && loaded.unused.iter().all(|name| is_condenser(name)), "{loaded:?}");
         assert_eq!(weights_hash(&read.condenser), condenser);
-        let loaded = load_part(&mut read, &Clift::stage1_part(), &stage1.weights).unwrap();
+        let loaded = load_part(&mut read, &Network::stage1_part(), &stage1.weights).unwrap();
         loaded.require_all(&stage1.weights).unwrap();
     }
 
@@ -141,7 +141,7 @@ mod tests {
         let device = Device::flex();
         for variant in CliftVariant::ALL {
             let config = small_config(variant);
-            let network = Clift::new(&config, 3, &device);
+            let network = Network::new(&config, 3, &device);
             let path = folder.path().join(variant.as_str());
             // The smallest file with a renderer.
             let renderer = PathFilter::from_predicate(|name, _| name.starts_with("renderer."));

@@ -234,7 +234,7 @@ fn members(views: &ClipViews, group: &ContextGroup) -> ClipViews {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{Clift, ModelConfig};
+    use clift_model::{ModelConfig, Network};
 
     use super::*;
 
@@ -247,7 +247,7 @@ mod tests {
             num_encoder_blocks: 1,
             ..ModelConfig::default()
         };
-        let network = Clift::new(&config, 3, &Device::flex());
+        let network = Network::new(&config, 3, &Device::flex());
         let model = TrainedModel { network, config, has_condenser: true, device: Device::flex() };
         // Views of 2 x 3 patches.
         let counts =

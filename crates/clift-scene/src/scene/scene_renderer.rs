@@ -299,7 +299,7 @@ impl RenderedView {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::{CameraEncoding, Clift, SelectionPreset, psnr, save_weights};
+    use clift_model::{CameraEncoding, Network, SelectionPreset, psnr, save_weights};
 
     use super::*;
     use crate::scene::scene::tests::{camera, scene, scene_of_groups};
@@ -339,7 +339,7 @@ mod tests {
         count: usize,
         tolerance: f32,
     ) {
-        let renderer = Clift::new(config, 3, device).renderer;
+        let renderer = Network::new(config, 3, device).renderer;
         let scene = whole_scene(&renderer, config);
         let context = Cameras::of_views(&scene.context, scene.height, scene.width, device).unwrap();
         let mut scene_renderer = SceneRenderer::new(&scene, renderer.clone(), preset.rules(), device).unwrap();
@@ -387,7 +387,7 @@ mod tests {
     fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
         let device = Device::flex();
         for config in CameraEncoding::ALL.map(encoded) {
-            let renderer = Clift::new(&config, 3, &device).renderer;
+            let renderer = Network::new(&config, 3, &device).renderer;
             let scene = grouped_scene(&renderer, &config);
             let rules = SelectionPreset::Paper.rules();
             let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
@@ -478,7 +478,7 @@ mod tests {
             (CameraEncoding::Prope, PatchGrids::Four),
         ] {
             let config = ModelConfig { patch_grids: grids, ..encoded(encoding) };
-            let renderer = Clift::new(&config, 3, &device).renderer;
+            let renderer = Network::new(&config, 3, &device).renderer;
             let scene = whole_scene(&renderer, &config);
             let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
             let mut frame = |size: [usize; 2], count| {
@@ -518,7 +518,7 @@ mod tests {
         let device = Device::flex();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
-        let model = Clift::new(&config(), 3, &device);
+        let model = Network::new(&config(), 3, &device);
         let scene = whole_scene(&model.renderer, &config());
         save_weights(&model, &path).unwrap();
         let renderer = load_renderer(&scene, &path, &device).unwrap();
@@ -534,7 +534,7 @@ mod tests {
         assert_refused(|model| model.num_heads = 1, &expected);
         // The same holds for camera-relative attention, which has no weights.
         assert_refused(|model| model.camera_encoding = CameraEncoding::Gta, &expected);
-        save_weights(&Clift::new(&config(), 4, &device), &path).unwrap();
+        save_weights(&Network::new(&config(), 4, &device), &path).unwrap();
         assert_refused(|_| (), &expected);
         save_weights(&model.encoder, &path).unwrap();
         assert_refused(|model| model.num_renderer_blocks = 1, "parameters of the scene's renderer are missing");

@@ -8,7 +8,7 @@ use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
 use clift_core::{make_folder, publish_folder, remove_folder};
-use clift_model::{Clift, ModelConfig, first_not_f32};
+use clift_model::{ModelConfig, Network, first_not_f32};
 
 use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};
 use crate::config::config::CheckpointConfig;
@@ -141,7 +141,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// As [`load`](Self::load).
-    pub fn load_model(&self, step: u64, model: Clift) -> Result<Clift, TrainError> {
+    pub fn load_model(&self, step: u64, model: Network) -> Result<Network, TrainError> {
         let path = self.path_of(step);
         apply_model(&verify(&path)?, &path, self.model.as_ref(), model)
     }
@@ -278,8 +278,8 @@ fn apply_model(
     state: &State,
     folder: &Path,
     expected: Option<&ModelConfig>,
-    model: Clift,
-) -> Result<Clift, TrainError> {
+    model: Network,
+) -> Result<Network, TrainError> {
     let bad = |name: &str, reason: String| bad(folder, name, reason);
     if let (Some(model), Some(expected)) = (&state.model, expected)
         && *expected != (ModelConfig { patch_grids: expected.patch_grids, ..model.clone() })
@@ -316,7 +316,7 @@ mod tests {
     fn saved(root: &Path) -> (TrainState, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = burn::tensor::Device::flex().autodiff();
-        let model = clift_model::Clift::new(&config, 0, &device);
+        let model = clift_model::Network::new(&config, 0, &device);
         let train_state = TrainState::new(model, &crate::config::config::OptimizerConfig::default(), device);
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
         let step =

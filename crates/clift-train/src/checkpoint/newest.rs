@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use clift_model::{Clift, TrainedModel};
+use clift_model::{Network, TrainedModel};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::config::config::{CheckpointConfig, Config};
@@ -48,7 +48,7 @@ impl NewestCheckpoint {
     /// # Errors
     /// As [`Checkpoints::load`].
     pub fn open(&self, config: &Config, run: &Path, device: &Device) -> Result<TrainedModel, TrainError> {
-        let initial = Clift::new(&config.model, config.seed, device);
+        let initial = Network::new(&config.model, config.seed, device);
         let checkpoints = checkpoints(run, self.stage).with_model(config.model.clone());
         let network = checkpoints.load_model(self.step, initial)?;
         Ok(TrainedModel::snapshot(&network, &config.model, self.stage == Stage::Stage2))

@@ -7,7 +7,7 @@ use burn::store::PathFilter;
 use clift_core::replace_file;
 use clift_data::write_state_dict;
 use clift_model::{
-    CameraEncoding, Clift, DeviceName, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TrainedModel, published_tensors,
+    CameraEncoding, DeviceName, ModelConfig, ModelPath, Network, PREFIX, PROJECTIONS, TrainedModel, published_tensors,
     save_part_f16,
 };
 use clift_scene::TokenCodec;
@@ -134,7 +134,7 @@ fn export_published(
 fn export_f16(config: &Config, model: &ModelPath, folder: &Path) -> Result<Exported, TrainError> {
     require_absent(folder)?;
     let trained = TrainedModel::open_with(model, &config.model, &DeviceName::default().open()?)?;
-    let part = if trained.has_condenser { PathFilter::all() } else { Clift::stage1_part() };
+    let part = if trained.has_condenser { PathFilter::all() } else { Network::stage1_part() };
     let parameters = publish_model_dir(folder, |written| {
         save_part_f16(&trained.network, &part, &written.weights)?;
         for name in ["config.toml", "import.json"] {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_model::{Clift, ModelPath, check_condenser, check_sizes, find_shipped, load_part, refuse_checkpoint};
+use clift_model::{ModelPath, Network, check_condenser, check_sizes, find_shipped, load_part, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};
 use crate::error::TrainError;
@@ -13,17 +13,17 @@ use crate::stage::interpolation::interpolate;
 /// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
 /// the same stage of another run, from a model directory, a weight file or the [shipped model](find_shipped). Reports which parameters were loaded.
 pub(crate) fn init_from(
-    mut model: Clift,
+    mut model: Network,
     config: &Config,
     stage: Stage,
     sink: &mut dyn Sink,
-) -> Result<Clift, TrainError> {
+) -> Result<Network, TrainError> {
     let (from, part, what, lack) = if stage == Stage::Stage1 {
         let lack = "no tensor of the file fits this model";
-        (&config.stage1.init_from, Clift::stage1_part(), "weight file for stage1.init_from", lack)
+        (&config.stage1.init_from, Network::stage1_part(), "weight file for stage1.init_from", lack)
     } else {
         let lack = "the file has no condenser";
-        (&config.stage2.init_from, Clift::condenser_part(), "weight file for stage2.init_from", lack)
+        (&config.stage2.init_from, Network::condenser_part(), "weight file for stage2.init_from", lack)
     };
     let Some(from) = from else { return Ok(model) };
     let from = &*find_shipped(from)?;
@@ -61,10 +61,10 @@ pub(crate) fn init_from(
 /// of the initial condenser, to its end. `stage1` is called where the position is not the end.
 pub(crate) fn stage2_weights(
     config: &Config,
-    stage1: impl FnOnce() -> Result<Clift, TrainError>,
-    trained: Clift,
+    stage1: impl FnOnce() -> Result<Network, TrainError>,
+    trained: Network,
     sink: &mut dyn Sink,
-) -> Result<Clift, TrainError> {
+) -> Result<Network, TrainError> {
     let Stage2Config { weight_interpolation: position, init_from: from, .. } = &config.stage2;
     if *position == 1.0 {
         return Ok(trained);

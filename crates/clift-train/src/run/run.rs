@@ -12,7 +12,7 @@ use clift_data::{
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, Summary, write_skip_report};
 use clift_model::{
-    Clift, LPIPS_COMMAND, ModelPath, TrainedModel, check_sizes, load_part, save_part, save_weights, weights_hash,
+    LPIPS_COMMAND, ModelPath, Network, TrainedModel, check_sizes, load_part, save_part, save_weights, weights_hash,
 };
 use clift_scene::TokenCodec;
 
@@ -33,6 +33,7 @@ use crate::run::init_from::{init_from, stage2_weights};
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, RunOptions, open_folder, require_run};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
+use crate::run::train_loop::train_stage;
 use crate::run::training_data::TrainingData;
 use crate::run::validation::{EvalRequest, Validation};
 use crate::stage::settings::StageSettings;
@@ -135,20 +136,42 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Option<Summary>, TrainError> {
-        let stages = self.config.stages();
-        let wanted = |stage: Stage| stages.contains(&stage) && only.is_none_or(|only| only == stage.into());
         let summary = self.folder("eval").join(SUMMARY);
         // Rank 0 looks at the files for all.
         let has_weights = || Ok([Stage::Stage1, Stage::Stage2].map(|stage| self.weights(stage).exists()));
         let [has_stage1, has_stage2] = self.ranks.from_root(has_weights)?;
-        let is_trained = has_stage1 && (has_stage2 || !stages.contains(&Stage::Stage2));
+        let is_trained = has_stage1 && (has_stage2 || !self.config.stages().contains(&Stage::Stage2));
         if self.ranks.from_root(|| Ok(only.is_none() && is_trained && summary.exists()))? {
             return self.ranks.is_root().then(|| read_finished(&self.config.run_dir, sink)).transpose();
         }
         if self.ranks.is_root() && !is_trained && summary.exists() {
-            // Of former weights: of stage 1 alone, or before `--extend`.
+            // Of former weights, of stage 1 alone.
             std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
         }
+        let steps: [(RunStep, bool, MakeStep<'_>); 5] = [
+            (Stage::Stage1.into(), has_stage1, Training::train_stage1),
+            (RunStep::Clusters, has_stage2 && only.is_none(), Training::make_clusters),
+            (Stage::Stage2.into(), has_stage2, Training::train_stage2),
+            // The codec of stage 2 is fitted where it is missing.
+            (Stage::Stage2.into(), false, Training::fit_codec),
+            (RunStep::Eval, false, Training::evaluate),
+        ];
+        let run_steps = self.config.run_steps();
+        let is_wanted = |step: RunStep| run_steps.contains(&step) && only.is_none_or(|only| only == step);
+        let mut training = self.open_training(stop, sink)?;
+        if is_wanted(Stage::Stage2.into()) && !has_stage2 {
+            self.check_init_from()?;
+        }
+        for (step, is_done, make) in steps {
+            if is_wanted(step) && !is_done {
+                make(&mut training, sink)?;
+            }
+        }
+        Ok(training.summary)
+    }
+
+    /// Opens the data of the steps.
+    fn open_training<'a>(&'a self, stop: &'a AtomicBool, sink: &mut dyn Sink) -> Result<Training<'a>, TrainError> {
         self.report_opening(Split::Train, sink);
         let mut progress = |done, total| sink.event(&Event::Scan { done, total });
         let opened = open_training_dataset(&self.config.data, self.config.last_gap_step(), &mut progress)?;
@@ -158,37 +181,16 @@ impl Run {
         if is_divided && let Some(warning) = validation.mark_training_scenes(reader.source.as_ref()) {
             sink.event(&Event::Warning(warning));
         }
-        let train_stage2 = wanted(Stage::Stage2) && !has_stage2;
+        Ok(Training { run: self, reader, validation, stop, stage1: None, clusters: None, summary: None })
+    }
+
+    /// Finds a wrong `stage2.init_from` before the stages take their time.
+    fn check_init_from(&self) -> Result<(), TrainError> {
         let needs_start = self.config.stage2.weight_interpolation < 1.0;
-        if train_stage2 && (needs_start || !self.folder("stage2").join("checkpoints").exists()) {
-            // A wrong `stage2.init_from` is found before the stages take their time.
+        if needs_start || !self.folder("stage2").join("checkpoints").exists() {
             init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?;
         }
-        let stage1 = if wanted(Stage::Stage1) && !has_stage1 {
-            self.train_stage1(&reader, &validation, stop, sink)?
-        } else {
-            self.load_stage1(only)?
-        };
-        if only == Some(RunStep::Clusters) || train_stage2 {
-            let cache = self.clusters(only, &reader, &stage1, stop, sink)?;
-            if train_stage2 {
-                self.train_stage2(&reader, cache, &validation, stage1, stop, sink)?;
-            }
-        }
-        if wanted(Stage::Stage2) && self.ranks.is_root() {
-            ensure_codec(&self.config, &self.weights(Stage::Stage2), &self.device, &reader, stop, sink)?;
-        }
-        if only.is_some() {
-            return Ok(None);
-        }
-        // After rank 0 has fitted the codec, which all ranks read.
-        self.ranks.from_root(|| require_run(&self.config.run_dir))?;
-        let folder = self.folder("eval");
-        let folder =
-            if self.ranks.is_root() { EvalFolder::open(&folder, true, sink)? } else { EvalFolder::unlocked(folder) };
-        let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
-        let summary = validation.evaluate(&self.models(sink)?, &request, &self.ranks, stop, sink)?;
-        Ok(self.ranks.is_root().then_some(summary))
+        Ok(())
     }
 
     /// Evaluates the run. `beside` are other runs, evaluated on the same views: one with the same stage 1 whose stage 2 was
@@ -279,44 +281,6 @@ impl Run {
         Validation::new(&self.config, eval, reader, frames, &self.device, sink)
     }
 
-    fn train_stage1(
-        &self,
-        reader: &ClipReader,
-        validation: &Validation,
-        stop: &AtomicBool,
-        sink: &mut dyn Sink,
-    ) -> Result<Clift, TrainError> {
-        let batches = Stage1Batches::new(&self.config, reader, self.parts(Stage::Stage1))?;
-        let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
-        let start = |sink: &mut dyn Sink| init_from(self.new_model(), &self.config, Stage::Stage1, sink);
-        let model = self.plan(Stage::Stage1, batches).train(start, validation, stop, sink)?;
-        self.ranks.from_root(|| Ok(save_part(&model, &Clift::stage1_part(), &self.weights(Stage::Stage1))?))?;
-        Ok(model)
-    }
-
-    fn train_stage2(
-        &self,
-        reader: &ClipReader,
-        cache: ClusterCache,
-        validation: &Validation,
-        stage1: Clift,
-        stop: &AtomicBool,
-        sink: &mut dyn Sink,
-    ) -> Result<(), TrainError> {
-        let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache), self.parts(Stage::Stage2))?;
-        let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
-        // The condenser of stage 1 takes no gradient.
-        let start = |sink: &mut dyn Sink| {
-            let initial = init_from(self.new_model(), &self.config, Stage::Stage2, sink)?;
-            Ok(Clift { condenser: initial.condenser, ..stage1 })
-        };
-        let trained = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?.valid();
-        self.ranks.from_root(|| {
-            let model = stage2_weights(&self.config, || self.load_stage1(None), trained, sink)?;
-            Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
-        })
-    }
-
     fn parts(&self, stage: Stage) -> BatchParts {
         let StageSettings { batch_size, accumulate, .. } = self.config.stage(stage);
         BatchParts::new(batch_size, accumulate, &self.ranks)
@@ -334,16 +298,13 @@ impl Run {
         }
     }
 
-    fn clusters(
-        &self,
-        only: Option<RunStep>,
-        reader: &ClipReader,
-        model: &Clift,
-        stop: &AtomicBool,
-        sink: &mut dyn Sink,
-    ) -> Result<ClusterCache, TrainError> {
+    fn new_model(&self) -> Network {
+        Network::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
+    }
+
+    /// Opens the cluster cache of an encoder; `None` if it is not built.
+    fn open_clusters(&self, encoder_hash: &str) -> Result<Option<ClusterCache>, TrainError> {
         let folder = self.folder("clusters");
-        let encoder_hash = &weights_hash(&model.encoder);
         let is_built = self.ranks.from_root(|| {
             let is_built = folder.exists();
             if is_built {
@@ -351,26 +312,14 @@ impl Run {
             }
             Ok(is_built)
         })?;
-        if is_built {
-            return ClusterCache::open(&folder, &self.config, encoder_hash);
-        }
-        if only == Some(RunStep::Train(Stage::Stage2)) {
-            let what = "the cluster cache";
-            return Err(TrainError::Missing { stage: "stage2", what, first: "--only clusters", path: folder });
-        }
-        let encoder = model.encoder.valid();
-        let (config, device, ranks) = (&self.config, &self.device, &self.ranks);
-        ClusterBuilder { config, reader, encoder: &encoder, encoder_hash, device, ranks }.build(&folder, stop, sink)
+        is_built.then(|| ClusterCache::open(&folder, &self.config, encoder_hash)).transpose()
     }
 
-    fn new_model(&self) -> Clift {
-        Clift::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
-    }
-
-    fn load_stage1(&self, only: Option<RunStep>) -> Result<Clift, TrainError> {
-        let path = self.require_stage1(only.unwrap_or(Stage::Stage2.into()))?;
+    /// Loads the model of stage 1, which `step` needs.
+    fn load_stage1(&self, step: RunStep) -> Result<Network, TrainError> {
+        let path = self.require_stage1(step)?;
         let mut model = self.new_model();
-        load_part(&mut model, &Clift::stage1_part(), &path)?.require_all(&path)?;
+        load_part(&mut model, &Network::stage1_part(), &path)?.require_all(&path)?;
         Ok(model)
     }
 
@@ -410,6 +359,105 @@ impl Run {
 
     fn weights(&self, stage: Stage) -> PathBuf {
         self.folder(stage.name()).join("model.safetensors")
+    }
+}
+
+/// Makes a step of a run.
+type MakeStep<'a> = fn(&mut Training<'a>, &mut dyn Sink) -> Result<(), TrainError>;
+
+/// What the steps of a training share: the data, and the results of the steps made so far.
+struct Training<'a> {
+    run: &'a Run,
+    reader: ClipReader,
+    validation: Validation<'a>,
+    stop: &'a AtomicBool,
+    /// The model of stage 1, if this process has trained or loaded it.
+    stage1: Option<Network>,
+    /// The cluster cache, if this process has made or opened it.
+    clusters: Option<ClusterCache>,
+    /// The evaluation, on rank 0.
+    summary: Option<Summary>,
+}
+
+impl Training<'_> {
+    fn train_stage1(&mut self, sink: &mut dyn Sink) -> Result<(), TrainError> {
+        let Self { run, reader, validation, stop, .. } = self;
+        let batches = Stage1Batches::new(&run.config, reader, run.parts(Stage::Stage1))?;
+        let plan = run.plan(Stage::Stage1, Arc::new(move |step| batches.batch(step)));
+        let start = |sink: &mut dyn Sink| init_from(run.new_model(), &run.config, Stage::Stage1, sink);
+        let model = train_stage(&plan, start, validation, stop, sink)?;
+        run.ranks.from_root(|| Ok(save_part(&model, &Network::stage1_part(), &run.weights(Stage::Stage1))?))?;
+        self.stage1 = Some(model);
+        Ok(())
+    }
+
+    /// Opens the cluster cache, or builds it.
+    fn make_clusters(&mut self, sink: &mut dyn Sink) -> Result<(), TrainError> {
+        let model = self.take_stage1(RunStep::Clusters)?;
+        let Self { run, reader, stop, .. } = self;
+        let encoder_hash = &weights_hash(&model.encoder);
+        self.clusters = match run.open_clusters(encoder_hash)? {
+            None => {
+                let (config, device, ranks) = (&run.config, &run.device, &run.ranks);
+                let encoder = &model.encoder.valid();
+                let builder = ClusterBuilder { config, reader, encoder, encoder_hash, device, ranks };
+                Some(builder.build(&run.folder("clusters"), stop, sink)?)
+            }
+            clusters => clusters,
+        };
+        self.stage1 = Some(model);
+        Ok(())
+    }
+
+    fn train_stage2(&mut self, sink: &mut dyn Sink) -> Result<(), TrainError> {
+        let stage1 = self.take_stage1(Stage::Stage2.into())?;
+        let Self { run, reader, validation, stop, clusters, .. } = self;
+        let clusters = match clusters.take() {
+            None => run.open_clusters(&weights_hash(&stage1.encoder))?,
+            clusters => clusters,
+        };
+        let Some(clusters) = clusters else {
+            let (what, path) = ("the cluster cache", run.folder("clusters"));
+            return Err(TrainError::Missing { stage: "stage2", what, first: "--only clusters", path });
+        };
+        let batches = Stage2Batches::new(&run.config, reader, Arc::new(clusters), run.parts(Stage::Stage2))?;
+        let plan = run.plan(Stage::Stage2, Arc::new(move |step| batches.batch(step)));
+        // The condenser of stage 1 takes no gradient.
+        let start = |sink: &mut dyn Sink| {
+            let initial = init_from(run.new_model(), &run.config, Stage::Stage2, sink)?;
+            Ok(Network { condenser: initial.condenser, ..stage1 })
+        };
+        let trained = train_stage(&plan, start, validation, stop, sink)?.valid();
+        run.ranks.from_root(|| {
+            let model = stage2_weights(&run.config, || run.load_stage1(Stage::Stage2.into()), trained, sink)?;
+            Ok(save_weights(&model, &run.weights(Stage::Stage2))?)
+        })
+    }
+
+    /// Returns the model of stage 1, which `step` needs: the trained one, or that of an earlier process.
+    fn take_stage1(&mut self, step: RunStep) -> Result<Network, TrainError> {
+        self.stage1.take().map_or_else(|| self.run.load_stage1(step), Ok)
+    }
+
+    fn fit_codec(&mut self, sink: &mut dyn Sink) -> Result<(), TrainError> {
+        let Self { run, reader, stop, .. } = self;
+        if !run.ranks.is_root() {
+            return Ok(());
+        }
+        ensure_codec(&run.config, &run.weights(Stage::Stage2), &run.device, reader, stop, sink)
+    }
+
+    fn evaluate(&mut self, sink: &mut dyn Sink) -> Result<(), TrainError> {
+        let Self { run, validation, stop, .. } = self;
+        // After rank 0 has fitted the codec, which all ranks read.
+        run.ranks.from_root(|| require_run(&run.config.run_dir))?;
+        let folder = run.folder("eval");
+        let folder =
+            if run.ranks.is_root() { EvalFolder::open(&folder, true, sink)? } else { EvalFolder::unlocked(folder) };
+        let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
+        let summary = validation.evaluate(&run.models(sink)?, &request, &run.ranks, stop, sink)?;
+        self.summary = run.ranks.is_root().then_some(summary);
+        Ok(())
     }
 }
 

@@ -7,7 +7,7 @@ use burn::module::Module;
 use clift_core::make_folder;
 use clift_data::plural;
 use clift_eval::peak_bytes;
-use clift_model::{Clift, psnr_of_mse, weights_hash};
+use clift_model::{Network, psnr_of_mse, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, TrainingPosition};
@@ -29,68 +29,66 @@ use crate::step::schedule::learning_rate;
 use crate::step::step_guard::{BatchScenes, LossHistory, SkippedStep, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
 
-impl StagePlan<'_> {
-    /// Trains the remaining steps and returns the model. `start` makes the initial model if there is no checkpoint.
-    pub fn train(
-        &self,
-        start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
-        validation: &Validation,
-        stop: &AtomicBool,
-        sink: &mut dyn Sink,
-    ) -> Result<Clift, TrainError> {
-        let started = Instant::now();
-        let Self { settings, config, folder, device, ranks, .. } = self;
-        let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
-        let checkpoints = Checkpoints::new(folder.join("checkpoints"), config.checkpoint.clone());
-        let checkpoints = checkpoints.with_model(config.model.clone());
-        let newest = ranks.from_root(|| {
-            require_run(&config.run_dir)?;
-            checkpoints.newest_step()
-        })?;
-        let model = match newest {
-            // The checkpoint replaces all parameters.
-            Some(_) => Clift::new(&config.model, config.seed, device),
-            None => start(sink)?,
-        };
-        let loss = Loss::load(&config.loss, device)?;
-        for term in loss.describe() {
-            sink.event(&Event::Message(term));
-        }
-        let mut train_state = TrainState {
-            loss,
-            activation_checkpointing: config.activation_checkpointing,
-            precision: config.precision,
-            loss_scale: LossScale::of(config.precision),
-            ..TrainState::new(model, optimizer, device.clone())
-        };
-        let progress = match newest {
-            Some(_) if ranks.is_root() => checkpoints.resume(&mut train_state)?,
-            Some(step) => Some(checkpoints.load(step, &mut train_state)?),
-            None => None,
-        };
-        let progress = progress.unwrap_or_default();
-        train_state.model = freeze(stage, train_state.model);
-        let mut log = if ranks.is_root() {
-            make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
-            RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?
-        } else {
-            RunLog::silent(sink)
-        };
-        require_same_weights(&train_state, ranks)?;
-        for line in parts_notes(self.parts, ranks) {
-            log.event(&Event::Message(line));
-        }
-        log.event(&Event::StepStarted { run_step: stage.into(), done: progress.step, num_steps });
-
-        let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
-        let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
-        training.log.event(&Event::StepFinished { run_step: stage.into(), elapsed_s: started.elapsed().as_secs_f64() });
-        Ok(model)
+/// Trains the remaining steps of a stage and returns the model. `start` makes the initial model if there is no checkpoint.
+pub(crate) fn train_stage(
+    plan: &StagePlan,
+    start: impl FnOnce(&mut dyn Sink) -> Result<Network, TrainError>,
+    validation: &Validation,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<Network, TrainError> {
+    let started = Instant::now();
+    let StagePlan { settings, config, folder, device, ranks, .. } = plan;
+    let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
+    let checkpoints = Checkpoints::new(folder.join("checkpoints"), config.checkpoint.clone());
+    let checkpoints = checkpoints.with_model(config.model.clone());
+    let newest = ranks.from_root(|| {
+        require_run(&config.run_dir)?;
+        checkpoints.newest_step()
+    })?;
+    let model = match newest {
+        // The checkpoint replaces all parameters.
+        Some(_) => Network::new(&config.model, config.seed, device),
+        None => start(sink)?,
+    };
+    let loss = Loss::load(&config.loss, device)?;
+    for term in loss.describe() {
+        sink.event(&Event::Message(term));
     }
+    let mut train_state = TrainState {
+        loss,
+        activation_checkpointing: config.activation_checkpointing,
+        precision: config.precision,
+        loss_scale: LossScale::of(config.precision),
+        ..TrainState::new(model, optimizer, device.clone())
+    };
+    let progress = match newest {
+        Some(_) if ranks.is_root() => checkpoints.resume(&mut train_state)?,
+        Some(step) => Some(checkpoints.load(step, &mut train_state)?),
+        None => None,
+    };
+    let progress = progress.unwrap_or_default();
+    train_state.model = freeze(stage, train_state.model);
+    let mut log = if ranks.is_root() {
+        make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
+        RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?
+    } else {
+        RunLog::silent(sink)
+    };
+    require_same_weights(&train_state, ranks)?;
+    for line in parts_notes(plan.parts, ranks) {
+        log.event(&Event::Message(line));
+    }
+    log.event(&Event::StepStarted { run_step: stage.into(), done: progress.step, num_steps });
+
+    let mut training = TrainLoop::new(plan, checkpoints, progress, validation, stop, log);
+    let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
+    training.log.event(&Event::StepFinished { run_step: stage.into(), elapsed_s: started.elapsed().as_secs_f64() });
+    Ok(model)
 }
 
 /// A stage during training.
-pub(crate) struct TrainLoop<'a> {
+struct TrainLoop<'a> {
     plan: &'a StagePlan<'a>,
     checkpoints: Checkpoints,
     progress: TrainingPosition,
@@ -103,12 +101,12 @@ pub(crate) struct TrainLoop<'a> {
     pace: Option<Pace>,
     /// Last step with images of the present size; 0 before the first step of this process.
     last_step_of_size: u64,
-    pub(crate) log: RunLog<'a>,
+    log: RunLog<'a>,
 }
 
 impl<'a> TrainLoop<'a> {
     /// Resumes at `progress`, that of the newest checkpoint.
-    pub fn new(
+    fn new(
         plan: &'a StagePlan,
         checkpoints: Checkpoints,
         progress: TrainingPosition,
@@ -121,7 +119,7 @@ impl<'a> TrainLoop<'a> {
         Self { plan, checkpoints, saved, progress, validation, stop, batch_wait, pace, last_step_of_size: 0, log }
     }
 
-    pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
+    fn run(&mut self, mut train_state: TrainState) -> Result<Network, TrainError> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
         let mut batches = self.plan.prefetch(self.progress.step);
@@ -353,7 +351,7 @@ impl<'a> TrainLoop<'a> {
     }
 
     /// Adds the last step and the newest checkpoint to an error.
-    pub fn name_checkpoint(&self, error: TrainError) -> TrainError {
+    fn name_checkpoint(&self, error: TrainError) -> TrainError {
         let is_complete =
             matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. } | TrainError::Moved { .. });
         if is_complete || self.progress.step == 0 {

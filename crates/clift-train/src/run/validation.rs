@@ -11,7 +11,7 @@ use clift_eval::{
     EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, RunDescription, SceneFigures,
     SceneLimits, Summary, Sweep, training_scenes_note,
 };
-use clift_model::{Clift, TokenCount, TrainedModel};
+use clift_model::{Network, TokenCount, TrainedModel};
 use clift_scene::TokenCoding;
 
 use crate::config::config::Config;
@@ -93,7 +93,7 @@ impl<'a> Validation<'a> {
     /// As [`Evaluator::measure`]; a scene that cannot be read is skipped.
     pub fn validate(
         &self,
-        model: &Clift,
+        model: &Network,
         stage: Stage,
         step: u64,
         (folder, ranks): (&Path, &Ranks),

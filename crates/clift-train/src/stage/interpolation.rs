@@ -42,19 +42,19 @@ impl ModuleMapper for Interpolation {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{Clift, weights_hash};
+    use clift_model::{Network, weights_hash};
 
     use super::*;
     use crate::config::config::Config;
     use crate::config::parse::read_config;
     use crate::testing::fixture;
 
-    fn model(seed: u64) -> Clift {
+    fn model(seed: u64) -> Network {
         let (config, _) = read_config::<Config>(&fixture("../tests/micro.toml"), &[]).expect("valid");
-        Clift::new(&config.model, seed, &Device::flex())
+        Network::new(&config.model, seed, &Device::flex())
     }
 
-    fn values(model: &Clift) -> Vec<f32> {
+    fn values(model: &Network) -> Vec<f32> {
         let mut values = Values::default();
         model.visit(&mut values);
         values.0.into_iter().flat_map(|tensor| tensor.try_into_vec_as::<f32>().expect("on the CPU")).collect()

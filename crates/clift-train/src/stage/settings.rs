@@ -1,7 +1,7 @@
 //! Differences between the stages: steps, batch, learning rates, trained networks.
 
 use burn::module::Module;
-use clift_model::{Clift, Part};
+use clift_model::{Network, Part};
 
 use crate::config::config::{Config, OptimizerConfig, Stage1Config};
 use crate::events::Stage;
@@ -36,7 +36,7 @@ impl Stage {
 }
 
 /// Freezes the networks that the stage does not train: their parameters get no gradient and no weight decay.
-pub fn freeze(stage: Stage, mut model: Clift) -> Clift {
+pub fn freeze(stage: Stage, mut model: Network) -> Network {
     let trained = stage.trained();
     if !trained.contains(&Part::Encoder) {
         model.encoder = model.encoder.no_grad();

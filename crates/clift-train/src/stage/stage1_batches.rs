@@ -1,9 +1,7 @@
 //! Batches of stage 1: clips with random subsets of the tokens.
 
-use std::sync::Arc;
-
 use clift_core::{ClipViews, derive_seed, item_rng, step_rng};
-use clift_data::{ClipReader, ReadClip, TrainingClips, half_resolution_clips};
+use clift_data::{ClipReader, TrainingClips, half_size_reader};
 use rand::RngExt;
 use rand::seq::index::sample;
 
@@ -28,15 +26,13 @@ impl Stage1Batches {
     pub fn new(config: &Config, reader: &ClipReader, parts: BatchParts) -> Result<Self, TrainError> {
         let Config { data, stage1, .. } = config;
         let seed = derive_seed(config.seed, "stage1");
-        let clips = |read: Arc<ReadClip>| {
-            let clips = TrainingClips::new(reader.source.clone(), read, data.views.clone(), stage1.batch_size, seed);
+        let clips = |reader: ClipReader| {
+            let clips = TrainingClips::new(reader, data.views.clone(), stage1.batch_size, seed);
             clips.map(|clips| clips.with_flip(data.flip))
         };
         let has_half = config.stage(Stage::Stage1).half_resolution_steps > 0;
-        let half = has_half.then(|| clips(half_resolution_clips(data, reader)?)).transpose()?;
-        let whole = reader.clone();
-        let whole = clips(Arc::new(move |scene, views| whole.read(scene, views)))?;
-        Ok(Self { clips: whole, half_resolution_clips: half, config: config.clone(), parts, seed })
+        let half = has_half.then(|| clips(half_size_reader(data, reader)?)).transpose()?;
+        Ok(Self { clips: clips(reader.clone())?, half_resolution_clips: half, config: config.clone(), parts, seed })
     }
 
     /// Makes the batch of `step`, counted from 0.

@@ -6,7 +6,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
-use clift_model::{Clift, PassState};
+use clift_model::{Network, PassState};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -15,12 +15,12 @@ use crate::step::loss::{Loss, LossParts, Rendering};
 
 /// Adds the gradients of `share` times the loss of a batch to `accumulator`, and returns the loss.
 pub(crate) fn backward(
-    model: &Clift,
+    model: &Network,
     device_batch: &DeviceBatch,
     batch_tokens: &BatchTokens,
     (loss, step): (&Loss, u64),
     share: f64,
-    accumulator: &mut GradientsAccumulator<Clift>,
+    accumulator: &mut GradientsAccumulator<Network>,
 ) -> Result<LossParts, TrainError> {
     let mut add = |grads: Gradients| accumulator.accumulate(model, GradientsParams::from_grads(grads, model));
     let token_step = batch_tokens.step();
@@ -38,7 +38,7 @@ pub(crate) fn backward(
     let pass = device_batch.pass(model, &token_step);
     let last = leaf(inputs.pop().expect("the first input"));
     let rendering = Rendering::of(&pass, last.clone(), step);
-    let parts = loss.of(&rendering, device_batch.target_images.clone());
+    let parts = device_batch.loss(loss, rendering);
     let mut grads = parts.total.clone().mul_scalar(share).backward();
     let parts = LossParts { total: parts.total.inner(), mse: parts.mse.inner() };
     let mut gradient = StateGradient::take(&last, &mut grads);

@@ -2,7 +2,7 @@
 // N tokens, K kept tokens, D width
 
 use clift_data::{Clip, SkippedScene};
-use clift_model::{Clift, Clusters, RenderTokens, SceneClusters, Tokens};
+use clift_model::{Clusters, Network, RenderTokens, SceneClusters, Tokens};
 
 use crate::distributed::parts::BatchParts;
 use crate::error::TrainError;
@@ -61,8 +61,8 @@ impl StageBatch {
 
 impl BatchTokens {
     /// Selects the tokens of the renderer from the encoder's tokens.
-    pub(crate) fn step(&self) -> impl Fn(&Clift, Tokens) -> Result<RenderTokens, TrainError> {
-        move |model: &Clift, lift: Tokens| {
+    pub(crate) fn step(&self) -> impl Fn(&Network, Tokens) -> Result<RenderTokens, TrainError> {
+        move |model: &Network, lift: Tokens| {
             Ok(match self {
                 Self::All => lift.into(),
                 Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),

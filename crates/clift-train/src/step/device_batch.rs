@@ -1,9 +1,10 @@
 //! A batch on a device, and its loss.
 // B scenes, T target views, N tokens, D width
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Tensor, TensorData};
+use clift_core::ClipViews;
 use clift_data::Clip;
-use clift_model::{Cameras, Clift, Pass, TokenStep, Views, upload_images};
+use clift_model::{Cameras, Network, Pass, TokenStep, Views, upload_images};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -17,6 +18,30 @@ pub struct DeviceBatch {
     pub targets: Cameras,
     /// Images of the target views, `[B, T, H, W, 3]` in `[0, 1]`.
     pub target_images: Tensor<5>,
+    /// Weights of the target pixels in the loss; `None` where every pixel counts.
+    pub target_weights: Option<TargetWeights>,
+}
+
+/// Weights of the target pixels in the loss, see [`Clip::target_weights`].
+#[derive(Clone, Debug)]
+pub struct TargetWeights {
+    /// `[B, T, H, W, 1]` in `[0, 1]`.
+    values: Tensor<5>,
+    mean: f64,
+}
+
+impl TargetWeights {
+    /// Copies the weights of clips to a device; `None` if all pixels count, or none.
+    fn upload(clips: &[Clip], device: &Device) -> Option<Self> {
+        let ClipViews { height, width, .. } = clips.iter().find(|clip| clip.target_weights.is_some())?.target;
+        let num_targets = clips[0].target.num_views();
+        let one = vec![u8::MAX; num_targets * height * width];
+        let planes = clips.iter().flat_map(|clip| clip.target_weights.as_ref().unwrap_or(&one));
+        let values: Vec<f32> = planes.map(|weight| f32::from(*weight) / 255.0).collect();
+        let mean = values.iter().map(|weight| f64::from(*weight)).sum::<f64>() / values.len() as f64;
+        let data = TensorData::new(values, [clips.len(), num_targets, height, width, 1]);
+        (mean > 0.0).then(|| Self { values: Tensor::from_data(data, device), mean })
+    }
 }
 
 impl DeviceBatch {
@@ -31,6 +56,7 @@ impl DeviceBatch {
             context: Views::upload(&contexts, device)?,
             targets: Cameras::upload(&targets, device)?,
             target_images: upload_images(&targets, device)?,
+            target_weights: TargetWeights::upload(clips, device),
         })
     }
 }
@@ -45,11 +71,26 @@ impl DeviceBatch {
         };
         let context = Views { images: self.context.images.clone().inner(), cameras: cameras(&self.context.cameras) };
         let (targets, target_images) = (cameras(&self.targets), self.target_images.clone().inner());
-        Self { context, targets, target_images }
+        let untracked = |weights: &TargetWeights| TargetWeights { values: weights.values.clone().inner(), ..*weights };
+        Self { context, targets, target_images, target_weights: self.target_weights.as_ref().map(untracked) }
+    }
+
+    /// Returns the loss of a rendering. Masked pixels are replaced by the target's, so that they add nothing, and the loss
+    /// is divided by the share of the others.
+    pub(crate) fn loss(&self, loss: &Loss, rendering: Rendering) -> LossParts {
+        let target = self.target_images.clone();
+        let Some(TargetWeights { values, mean }) = &self.target_weights else { return loss.of(&rendering, target) };
+        let images = target.clone() + (rendering.images - target.clone()) * values.clone();
+        let LossParts { total, mse } = loss.of(&Rendering { images, ..rendering }, target);
+        LossParts { total: total.div_scalar(*mean), mse: mse.div_scalar(*mean) }
     }
 
     /// Describes the forward pass of a model from the context views to images of the target views.
-    pub(crate) fn pass<'a>(&'a self, model: &'a Clift, token_step: TokenStep<'a, TrainError>) -> Pass<'a, TrainError> {
+    pub(crate) fn pass<'a>(
+        &'a self,
+        model: &'a Network,
+        token_step: TokenStep<'a, TrainError>,
+    ) -> Pass<'a, TrainError> {
         Pass::new(model, &self.context, &self.targets, token_step)
     }
 }
@@ -59,7 +100,7 @@ impl DeviceBatch {
 /// # Errors
 /// Those of clusters that do not fit the tokens.
 pub fn render_loss(
-    model: &Clift,
+    model: &Network,
     device_batch: &DeviceBatch,
     batch_tokens: &BatchTokens,
     loss: &Loss,
@@ -67,5 +108,28 @@ pub fn render_loss(
 ) -> Result<LossParts, TrainError> {
     let token_step = batch_tokens.step();
     let pass = device_batch.pass(model, &token_step);
-    Ok(loss.of(&Rendering::of(&pass, pass.forward()?, step), device_batch.target_images.clone()))
+    Ok(device_batch.loss(loss, Rendering::of(&pass, pass.forward()?, step)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::step::seeded_inputs::{ClipShape, seeded_clip};
+
+    #[test]
+    fn masked_pixels_add_nothing_to_the_loss() {
+        let device = Device::flex();
+        let clip = seeded_clip(ClipShape { num_context: 2, num_targets: 2, size: [8, 8] }, 1, 0);
+        // Errors of 0.1 in the first view and of 0.5 in the second, whose pixels do not count.
+        let weights = [[255; 64], [0; 64]].concat();
+        let errors = [vec![0.1_f32; 192], vec![0.5; 192]].concat();
+        for (target_weights, expected) in [(Some(weights), 0.01), (Some(vec![0; 128]), 0.13), (None, 0.13)] {
+            let batch = DeviceBatch::upload(&[Clip { target_weights, ..clip.clone() }], &device).expect("one clip");
+            let errors = Tensor::from_data(TensorData::new(errors.clone(), [1, 2, 8, 8, 3]), &device);
+            let images = batch.target_images.clone() + errors;
+            let rendering = Rendering { images, tokens: Tensor::zeros([1, 1, 1], &device), step: 0 };
+            let mse: f32 = batch.loss(&Loss::default(), rendering).mse.into_scalar();
+            assert!((mse - expected).abs() < 1e-6, "{mse} is not {expected}");
+        }
+    }
 }

@@ -4,7 +4,7 @@ use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::{Camera, ClipViews, DMat3, DVec3, Intrinsics, Pose, item_rng, step_rng, uniform_below};
 use clift_data::Clip;
-use clift_model::{Clift, ModelConfig, SceneClusters};
+use clift_model::{ModelConfig, Network, SceneClusters};
 use rand::{Rng, RngExt};
 
 use crate::error::TrainError;
@@ -30,7 +30,7 @@ pub fn seeded_clip(shape: ClipShape, seed: u64, slot: usize) -> Clip {
     let context = (0..num_context).map(|view| along(num_context, view)).collect();
     let target = (0..num_targets).map(|view| 0.9 * along(num_targets, view)).collect();
     let context = views(context, size, &mut rng);
-    Clip { key: format!("bench-{slot}"), context, target: views(target, size, &mut rng) }
+    Clip { key: format!("bench-{slot}"), context, target: views(target, size, &mut rng), target_weights: None }
 }
 
 /// Makes views at positions in `[-1, 1]` of the arc.
@@ -109,7 +109,7 @@ pub fn seeded_uniform<const D: usize>(shape: [usize; D], seed: u64, purpose: &st
 
 /// Makes a model with seeded initial weights on the autodiff device. The gates of the condenser get random weights: their
 /// initial zeros would make all results and gradients behind them zero.
-pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
+pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Network {
     struct OpenGates {
         seed: u64,
         path: Vec<String>,
@@ -135,7 +135,7 @@ pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
             })
         }
     }
-    Clift::new(config, seed, &device.clone().autodiff()).map(&mut OpenGates { seed, path: Vec::new() })
+    Network::new(config, seed, &device.clone().autodiff()).map(&mut OpenGates { seed, path: Vec::new() })
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor};
-use clift_model::{Clift, Precision};
+use clift_model::{Network, Precision};
 
 use crate::config::config::OptimizerConfig;
 use crate::distributed::parts::BatchParts;
@@ -20,7 +20,7 @@ use crate::step::optimizer::{StageOptimizer, clip_factor, norm_on_device, scale_
 /// A model with its optimizer on an autodiff device.
 pub struct TrainState {
     /// The trained model.
-    pub model: Clift,
+    pub model: Network,
     /// Its optimizer.
     pub optimizer: StageOptimizer,
     /// The autodiff device.
@@ -50,7 +50,7 @@ pub struct Update {
 
 impl TrainState {
     /// Makes the state before the first update: mean squared error, f32, activations stored.
-    pub fn new(model: Clift, optimizer: &OptimizerConfig, device: Device) -> Self {
+    pub fn new(model: Network, optimizer: &OptimizerConfig, device: Device) -> Self {
         let (optimizer, loss) = (StageOptimizer::new(optimizer, &device), Loss::default());
         Self {
             model,
@@ -99,7 +99,7 @@ impl TrainState {
         let Self { model, mut optimizer, device, loss, activation_checkpointing, precision, loss_scale } = self;
         let _scope = precision.scope();
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
-        let mut accumulator = GradientsAccumulator::<Clift>::new();
+        let mut accumulator = GradientsAccumulator::<Network>::new();
         let mut sum = (ranks.num_ranks() > 1).then(GradientSum::default);
         let mut read = HostReads::default();
         for (round, micro_batch) in batch.rounds(parts).enumerate() {

@@ -47,7 +47,7 @@ pub struct EncodeArgs {
     pub split: Split,
     /// Context frames by position or file name, encoded together [default: groups of neighbours]
     ///
-    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
+    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension and folders:
     /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. Numbers alone are positions, unless one begins with a zero:
     /// `0005` is a name. By default, a DIR of the command line is encoded in groups of neighbours, as many views each as in
     /// training, that together contain every photo (up to 128); a view is rendered from the groups nearest to it. A scene of

@@ -3,7 +3,7 @@
 use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
-use clift_model::Clift;
+use clift_model::Network;
 use clift_train::{
     DeviceBatch, Loss, OptimizerConfig, Stage, StageBatch, StageOptimizer, TrainError, clip_global_norm, freeze,
     global_norm, render_loss, seeded_batch, seeded_model,
@@ -35,7 +35,7 @@ pub(crate) const CASES: &[StabilityCase] = &[StabilityCase {
 const STEPS: usize = 20;
 
 /// Returns the losses of [`STEPS`] updates on one batch.
-fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -> Result<Vec<f64>, TrainError> {
+fn losses(mut model: Network, batch: &StageBatch, device: &Device, in_f64: bool) -> Result<Vec<f64>, TrainError> {
     let config = OptimizerConfig::default();
     let mut optimizer = StageOptimizer::new(&config, device);
     let device = device.clone().autodiff();

@@ -20,6 +20,9 @@ use crate::sources::keys::{DL3DV_PREFIX, find_by_name};
 /// Chunks that are examined between two calls of the progress callback.
 const CHUNKS_PER_CALL: usize = 64;
 
+/// Largest number of chunks that are read at opening even without filters, so that what is odd in them is reported.
+const MAX_READ_CHUNKS: usize = 8;
+
 /// Progress callback: number of examined chunks, and of all.
 pub type ScanProgress<'a> = &'a mut dyn FnMut(usize, usize);
 
@@ -204,20 +207,28 @@ impl ChunkSource {
         Ok(())
     }
 
-    /// Reports the unusable frames of the scenes in memory, and chunks without checksums and time stamps.
+    /// Reports unusable frames, and chunks without checksums and time stamps: of the tables in memory, and of few chunks in
+    /// any case. An unreadable chunk is an error at its use.
     fn note_oddities(&mut self) {
+        let is_small = self.chunks.len() <= MAX_READ_CHUNKS;
+        let read = |chunk: &Chunk| if is_small { ChunkTable::read(&chunk.path).ok() } else { None };
+        let is_unread = |chunk: &Chunk| chunk.table.get().is_none() && chunk.cached.is_none();
+        let unread: Vec<_> =
+            self.chunks.par_iter().map(|chunk| if is_unread(chunk) { read(chunk) } else { None }).collect();
+        let table_of = |chunk: usize| self.chunks[chunk].table.get().or(unread[chunk].as_ref());
         let mut report = std::mem::take(&mut self.report);
         let (mut without_times, mut num_unchecked) = (Vec::new(), 0);
         for (index, Entry { key, chunk }) in self.scenes.iter().enumerate() {
-            let table = self.chunks[*chunk].table.get().and_then(|table| table.scenes.get(key));
+            let table =
+                table_of(*chunk).and_then(|table| table.scenes.get(key)).filter(|table| !table.images.is_empty());
             let unusable = table.map(|table| &table.unusable).or_else(|| Some(&self.cached(index)?.unusable));
             for (frame, reason) in unusable.into_iter().flatten() {
                 report.skip_frame(key, frame.to_string(), reason);
             }
             without_times.extend(table.filter(|table| table.timestamps.is_none()).map(|_| key.clone()));
         }
-        for chunk in &self.chunks {
-            num_unchecked += usize::from(chunk.table.get().is_some_and(|table| table.lacks_checksums));
+        for chunk in 0..self.chunks.len() {
+            num_unchecked += usize::from(table_of(chunk).is_some_and(|table| table.lacks_checksums));
         }
         let what = "without time stamps as int64, which are counted 0, 1, ..";
         report.notes.extend(note_on(&without_times, what));

@@ -211,7 +211,7 @@ mod tests {
         let mut is_decoded = false;
         let image = cache.scaled(photo, || {
             is_decoded = true;
-            photo.decode("k", 0)
+            photo.decode([0; 3], "k", 0).map(|(image, _)| image)
         });
         (image.unwrap(), is_decoded)
     }
@@ -219,12 +219,12 @@ mod tests {
     #[test]
     fn cached_photos_fit_to_the_same_pixels() {
         let root = tempfile::tempdir().unwrap();
-        let distorted = Lens { radial: [0.05, 0.0, 0.0], tangential: [0.0; 2] };
+        let distorted = Lens::from_colmap("SIMPLE_RADIAL", &[0.05]).unwrap();
         let cache = cache(root.path(), 1_000_000);
-        for (name, lens) in [("a.png", Lens { radial: [0.0; 3], tangential: [0.0; 2] }), ("b.png", distorted)] {
+        for (name, lens) in [("a.png", Lens::default()), ("b.png", distorted)] {
             let photo = photo(root.path(), name, &ramp(647, 801), lens);
             let fitted = |image: &RgbImage| fit_image(image, photo.camera.intrinsics, 32, 32, false).unwrap();
-            let expected = fitted(&photo.decode("k", 0).unwrap());
+            let expected = fitted(&photo.decode([0; 3], "k", 0).unwrap().0);
             for is_decoded in [true, false] {
                 let (image, was_decoded) = read_through(&cache, &photo);
                 assert_eq!((fitted(&image), was_decoded), (expected.clone(), is_decoded));
@@ -239,7 +239,7 @@ mod tests {
     #[test]
     fn changed_photos_and_damaged_files_are_decoded_again() {
         let root = tempfile::tempdir().unwrap();
-        let pinhole = Lens { radial: [0.0; 3], tangential: [0.0; 2] };
+        let pinhole = Lens::default();
         let first = photo(root.path(), "a.png", &ramp(640, 480), pinhole);
         let cache = cache(root.path(), 1_000_000);
         assert_eq!([(); 2].map(|()| read_through(&cache, &first).1), [true, false]);
@@ -260,7 +260,7 @@ mod tests {
     #[test]
     fn size_is_bounded_and_unused_files_make_room() {
         let root = tempfile::tempdir().unwrap();
-        let pinhole = Lens { radial: [0.0; 3], tangential: [0.0; 2] };
+        let pinhole = Lens::default();
         let photos = ["a.png", "b.png", "c.png"].map(|name| photo(root.path(), name, &ramp(640, 640), pinhole));
         let file_bytes = to_bytes(&ramp(32, 32)).len() as u64;
         let decoded = |cache: &ImageCache| photos.each_ref().map(|photo| read_through(cache, photo).1);
@@ -282,7 +282,7 @@ mod tests {
     #[ignore = "measures; run with --ignored --nocapture for the times"]
     fn cached_photos_are_read_20_times_faster() {
         let root = tempfile::tempdir().unwrap();
-        let distorted = Lens { radial: [0.05, 0.0, 0.0], tangential: [0.0; 2] };
+        let distorted = Lens::from_colmap("SIMPLE_RADIAL", &[0.05]).unwrap();
         let mut photo = photo(root.path(), "a.png", &ramp(4, 4), distorted);
         photo.path = root.path().join("a.jpg");
         std::fs::write(&photo.path, encode_jpeg(&ramp(1080, 1920), 95).unwrap()).unwrap();

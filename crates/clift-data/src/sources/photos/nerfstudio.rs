@@ -29,6 +29,8 @@ const MAX_NAME_BYTES: usize = 4096;
 const MIN_CALIBRATED_SCALE: f64 = 1.5;
 /// Largest share by which a principal point is off the image centre there.
 const MAX_CENTRE_OFFSET: f64 = 0.1;
+/// Largest number of distortion parameters of a camera: those of `FISHEYE624`.
+const MAX_DISTORTION_PARAMS: usize = 12;
 
 /// Defines a struct with the keys of a camera, which may occur at the top level and in a frame.
 macro_rules! with_optics {
@@ -50,8 +52,14 @@ macro_rules! with_optics {
             k2: Option<Number>,
             k3: Option<Number>,
             k4: Option<Number>,
+            k5: Option<Number>,
+            k6: Option<Number>,
             p1: Option<Number>,
             p2: Option<Number>,
+            sx1: Option<Number>,
+            sy1: Option<Number>,
+            omega: Option<Number>,
+            distortion_params: Option<Bounded<Number, MAX_DISTORTION_PARAMS>>,
         }
 
         impl $name {
@@ -63,8 +71,11 @@ macro_rules! with_optics {
                     focal: values([self.fl_x, self.fl_y]),
                     centre: values([self.cx, self.cy]),
                     angle: values([self.camera_angle_x, self.camera_angle_y]),
-                    radial: values([self.k1, self.k2, self.k3, self.k4]),
+                    radial: values([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6]),
                     tangential: values([self.p1, self.p2]),
+                    prism: values([self.sx1, self.sy1]),
+                    omega: self.omega.map(|Number(value)| value),
+                    distortion_params: self.distortion_params.as_ref().map(|list| list.0.as_slice()),
                 }
             }
         }
@@ -77,7 +88,11 @@ with_optics!(Document {
     val_filenames: Option<Bounded<String, MAX_FRAMES>>,
     test_filenames: Option<Bounded<String, MAX_FRAMES>>,
 });
-with_optics!(Entry { file_path: String, transform_matrix: Option<Bounded<[Number; 4], 4>>, });
+with_optics!(Entry {
+    file_path: String,
+    mask_path: Option<String>,
+    transform_matrix: Option<Bounded<[Number; 4], 4>>,
+});
 
 impl Document {
     /// Returns which frames the file holds out of training: those that are not in `train_filenames`, or those in
@@ -134,8 +149,12 @@ struct Optics<'a> {
     focal: [Option<f64>; 2],
     centre: [Option<f64>; 2],
     angle: [Option<f64>; 2],
-    radial: [Option<f64>; 4],
+    radial: [Option<f64>; 6],
     tangential: [Option<f64>; 2],
+    prism: [Option<f64>; 2],
+    omega: Option<f64>,
+    /// All distortion parameters of nerfstudio in one list, instead of the keys above.
+    distortion_params: Option<&'a [Number]>,
 }
 
 impl<'a> Optics<'a> {
@@ -150,24 +169,64 @@ impl<'a> Optics<'a> {
             focal: if has_focal { self.focal } else { top.focal },
             angle: if has_focal { self.angle } else { top.angle },
             centre: either(self.centre, top.centre),
-            radial: [0, 1, 2, 3].map(|i| self.radial[i].or(top.radial[i])),
+            radial: std::array::from_fn(|i| self.radial[i].or(top.radial[i])),
             tangential: either(self.tangential, top.tangential),
+            prism: either(self.prism, top.prism),
+            omega: self.omega.or(top.omega),
+            distortion_params: self.distortion_params.or(top.distortion_params),
         }
     }
 
-    /// Returns the lens; refuses lenses without undistortion.
+    /// Returns the lens of a nerfstudio or COLMAP model, its name in any case.
     fn lens(&self) -> Result<Lens, String> {
-        let model = self.camera_model.unwrap_or("OPENCV");
-        let known = ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "perspective"];
-        if !known.contains(&model) || self.is_fisheye == Some(true) {
-            let model = if self.is_fisheye == Some(true) { "OPENCV_FISHEYE" } else { model };
-            return Err(format!("camera_model is {model}, expected one of {}", known.join(", ")));
+        const PERSPECTIVE: [&str; 6] =
+            ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
+        const FISHEYE: [&str; 5] =
+            ["OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"];
+        const OTHERS: [&str; 5] =
+            ["FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE"];
+        let mut model = self.camera_model.unwrap_or("OPENCV").to_ascii_uppercase();
+        let is_in = |models: &[&str], model: &str| models.contains(&model);
+        if self.is_fisheye == Some(true) && is_in(&PERSPECTIVE, &model) {
+            model = "OPENCV_FISHEYE".into();
         }
-        let [k1, k2, k3, k4] = self.radial.map(Option::unwrap_or_default);
-        if k4 != 0.0 {
-            return Err(format!("k4 is {k4}, expected 0: lenses have k1, k2, k3, p1 and p2"));
+        let mut radial = self.radial.map(Option::unwrap_or_default);
+        let mut tangential = self.tangential.map(Option::unwrap_or_default);
+        let list: Vec<f64> = self.distortion_params.unwrap_or_default().iter().map(|number| number.0).collect();
+        let is_aria = is_in(&OTHERS[3..], &model);
+        match *list {
+            [k1, k2, k3, k4, p1, p2] if !is_aria => {
+                (radial, tangential) = ([k1, k2, k3, k4, 0.0, 0.0], [p1, p2]);
+            }
+            [k1, k2, k3, k4] if !is_aria => radial = [k1, k2, k3, k4, 0.0, 0.0],
+            _ if list.is_empty() != is_aria => {}
+            _ => {
+                let (count, expected) = (list.len(), if is_aria { "12" } else { "4 or 6" });
+                return Err(format!("distortion_params has {count} numbers, expected {expected} for {model}"));
+            }
         }
-        let lens = Lens { radial: [k1, k2, k3], tangential: self.tangential.map(Option::unwrap_or_default) };
+        let ([k1, k2, k3, k4, k5, k6], [p1, p2]) = (radial, tangential);
+        let [sx, sy] = self.prism.map(Option::unwrap_or_default);
+        let is_rational = k5 != 0.0 || k6 != 0.0;
+        let lens = match model.as_str() {
+            // nerfstudio's k4 is the coefficient of r^8, and OpenCV's one of a divisor.
+            name if is_in(&PERSPECTIVE, name) && !is_rational => {
+                Some(Lens { radial: [k1, k2, k3, k4, 0.0, 0.0], tangential, ..Lens::default() })
+            }
+            name if name == "FULL_OPENCV" || is_in(&PERSPECTIVE, name) => {
+                Lens::from_colmap("FULL_OPENCV", &[k1, k2, p1, p2, k3, k4, k5, k6])
+            }
+            name if is_in(&FISHEYE, name) => Lens::from_colmap("OPENCV_FISHEYE", &[k1, k2, k3, k4]),
+            "THIN_PRISM_FISHEYE" => Lens::from_colmap(&model, &[k1, k2, p1, p2, k3, k4, sx, sy]),
+            "FOV" => Lens::from_colmap(&model, &[self.omega.ok_or("expected omega of the FOV camera")?]),
+            _ if is_aria => Lens::from_colmap("RAD_TAN_THIN_PRISM_FISHEYE", &list),
+            _ => None,
+        };
+        let lens = lens.ok_or_else(|| {
+            let given = self.camera_model.unwrap_or("OPENCV");
+            let known = [&PERSPECTIVE[..], &FISHEYE, &OTHERS].concat().join(", ");
+            format!("camera_model is {given}, expected one of {known}")
+        })?;
         lens.validate().map(|()| lens).map_err(|error| error.to_string())
     }
 
@@ -233,6 +292,10 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
             if used.insert(image.clone()) { Ok(image) } else { Err("with the image of another frame".into()) }
         });
         let photo = found.and_then(|image| {
+            let mask = entry.mask_path.as_ref().map(|mask| folder.join(mask.replace('\\', "/")));
+            if mask.as_ref().is_some_and(|mask| !mask.is_file()) {
+                return Err("without the mask of its mask_path".to_owned());
+            }
             let optics = entry.optics().or(&top);
             let lens = optics.lens().map_err(|what| unusable(&what))?;
             let mut given = optics.size().map_err(|what| unusable(&what))?;
@@ -248,7 +311,8 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
             let intrinsics_norm = optics.intrinsics_norm(size).map_err(|what| unusable(&what))?;
             let (c2w, scale) = entry.pose().map_err(|what| unusable(&what))?;
             num_scaled = scale.map_or(num_scaled, |scale| (num_scaled.0 + 1, scale));
-            Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort)).map_err(|error| unusable(&error))
+            let photo = Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort));
+            photo.map(|photo| Photo { mask, ..photo }).map_err(|error| unusable(&error))
         });
         match photo {
             Ok(photo) => {

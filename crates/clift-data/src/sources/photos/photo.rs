@@ -1,18 +1,23 @@
 //! An image file with its camera, and a scene of such photos, in any layout with one file per frame.
 
+use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use clift_core::{Camera, DMat3, IntrinsicsNorm, Pose, RgbImage};
+use image::ImageFormat;
 use image::metadata::Orientation;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::files::listing::decode_name;
-use crate::geometry::lens::Lens;
-use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
+use crate::geometry::lens::{Lens, Projection};
+use crate::image::codec::{
+    apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha, read_header,
+};
 use crate::image::jpeg_scan::check_scans;
+use crate::image::lanczos::resize_lanczos;
 use crate::image::undistort::Undistortion;
 
 pub(crate) const MAX_FRAMES: usize = 100_000;
@@ -42,6 +47,8 @@ pub(crate) struct PhotoOptions {
     pub undistort: bool,
     /// Smallest columns and rows of the images of a default folder.
     pub min_size: [usize; 2],
+    /// Colour of masked and transparent pixels.
+    pub background: [u8; 3],
     /// Pixels from which poses were computed where the cameras fit both.
     pub poses_from: PosesFrom,
 }
@@ -62,6 +69,8 @@ pub(crate) struct Photo {
     pub undistortion: Option<Box<Undistortion>>,
     /// Aspect ratio (width over height) of the images to which the intrinsics apply.
     pub shape: Option<f64>,
+    /// Mask of the image: pixels of 0 are left out.
+    pub mask: Option<PathBuf>,
     /// Time stamp in microseconds, or the number at the end of the file name.
     pub time: Option<i64>,
     /// Whether the frame is held out of training; `None` if the camera file does not say.
@@ -137,6 +146,11 @@ impl Photo {
         (lens, undistort): (Lens, bool),
     ) -> Result<Self, DataError> {
         intrinsics_norm.validate()?;
+        if !undistort && lens.projection != Projection::Perspective {
+            let what =
+                "the images of a fisheye lens are not those of a pinhole camera; set data.files.undistort to true";
+            return Err(DataError::bad_camera(what.into()));
+        }
         let mut photo = Self::pinhole(path, Camera { intrinsics: intrinsics_norm, c2w });
         (photo.time, photo.shape) = (number_at_end(&photo.path), size.map(|[width, height]| width / height));
         if undistort && !lens.is_pinhole() {
@@ -150,7 +164,17 @@ impl Photo {
     /// Creates a photo of a pinhole camera.
     pub fn pinhole(path: PathBuf, camera: Camera<IntrinsicsNorm>) -> Self {
         let (view_turn, poses_from) = (Orientation::NoTransforms, PosesFrom::default());
-        Self { path, camera, undistortion: None, shape: None, time: None, is_held_out: None, view_turn, poses_from }
+        Self {
+            path,
+            camera,
+            undistortion: None,
+            shape: None,
+            mask: None,
+            time: None,
+            is_held_out: None,
+            view_turn,
+            poses_from,
+        }
     }
 
     pub fn read(&self) -> Result<Vec<u8>, DataError> {
@@ -175,20 +199,45 @@ impl Photo {
         checked.map_err(|what| DataError::DamagedImage { what, path: self.path.clone() })
     }
 
-    /// Decodes the image, turns it to the orientation of its camera and undistorts it.
-    pub fn decode(&self, key: &str, frame: usize) -> Result<RgbImage, DataError> {
+    /// Returns whether a mask or an alpha channel leaves pixels out.
+    pub fn has_coverage(&self) -> bool {
+        self.mask.is_some() || has_alpha(&self.path)
+    }
+
+    /// Decodes the image over a background, turns it to the orientation of its camera and undistorts it, and its coverage
+    /// likewise (see [`SceneSource::frame_with_coverage`](crate::SceneSource::frame_with_coverage)).
+    pub fn decode(
+        &self,
+        background: [u8; 3],
+        key: &str,
+        frame: usize,
+    ) -> Result<(RgbImage, Option<RgbImage>), DataError> {
         let bytes = self.read()?;
-        let image = decode_image(&bytes, key, frame)?;
+        let (mut image, alpha) = decode_with_alpha(&bytes, key, frame)?;
         let stored = [image.width, image.height];
         let is_plain = self.poses_from == PosesFrom::Stored && self.fits(stored);
         let pixels =
             if is_plain { Orientation::NoTransforms } else { self.turn(stored, exif_orientation(&bytes))?.pixels };
-        let image = apply_orientation(image, pixels);
-        let image = match &self.undistortion {
-            Some(undistortion) => undistortion.apply(&image),
-            None => image,
+        let mask = self.mask.as_ref().map(|mask| read_mask(mask, &image, key, frame)).transpose()?;
+        let coverage = match (alpha, mask) {
+            (Some(alpha), Some(mask)) => Some(alpha.iter().zip(mask).map(|(alpha, mask)| alpha & mask).collect()),
+            (alpha, mask) => alpha.or(mask),
         };
-        Ok(apply_orientation(image, self.view_turn))
+        let coverage = coverage.map(|coverage: Vec<u8>| {
+            for (pixel, share) in image.rgb.as_chunks_mut::<3>().0.iter_mut().zip(&coverage) {
+                *pixel = blend(*pixel, background, *share);
+            }
+            RgbImage { rgb: coverage.into_iter().flat_map(|share| [share; 3]).collect(), ..image }
+        });
+        let prepare = |image: RgbImage| {
+            let image = apply_orientation(image, pixels);
+            let image = match &self.undistortion {
+                Some(undistortion) => undistortion.apply(&image),
+                None => image,
+            };
+            apply_orientation(image, self.view_turn)
+        };
+        Ok((prepare(image), coverage.map(prepare)))
     }
 
     /// Turns the camera, and on load the image, by an orientation that does not mirror.
@@ -241,6 +290,36 @@ fn exchanges(orientation: Orientation) -> bool {
     orientation.to_exif() >= 5
 }
 
+/// Reads the mask of an image, `[height, width]`: 0 where the file is black, 255 elsewhere. Masks may be of another size.
+fn read_mask(path: &Path, image: &RgbImage, key: &str, frame: usize) -> Result<Vec<u8>, DataError> {
+    let bad = |what: String| DataError::BadScene {
+        what: format!("mask of frame {frame} of {key}: {what}"),
+        path: path.into(),
+    };
+    let bytes = read_bounded(path, MAX_IMAGE_BYTES, "reading a mask")?;
+    let mut mask = decode_image(&bytes, key, frame).map_err(|error| bad(error.to_string()))?;
+    // JPEG does not keep black exactly.
+    let black = if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) { 127 } else { 0 };
+    mask.rgb.iter_mut().for_each(|value| *value = if *value > black { u8::MAX } else { 0 });
+    let (from, to) = ([mask.width, mask.height], [image.width, image.height]);
+    if from != to {
+        let error = (from[0] * to[1]) as f64 / (from[1] * to[0]) as f64 - 1.0;
+        if error.abs() > MAX_SHAPE_ERROR {
+            return Err(bad(format!("{}x{} pixels, the image has {}x{}", from[0], from[1], to[0], to[1])));
+        }
+        mask = resize_lanczos(&mask, to[0], to[1]);
+    }
+    Ok(mask.rgb.as_chunks::<3>().0.iter().map(|pixel| pixel.iter().copied().fold(0, u8::max)).collect())
+}
+
+/// Returns a pixel over a background, at a share of 0 to 255.
+fn blend(pixel: [u8; 3], background: [u8; 3], share: u8) -> [u8; 3] {
+    let share = u32::from(share);
+    std::array::from_fn(|i| {
+        ((u32::from(pixel[i]) * share + u32::from(background[i]) * (255 - share) + 127) / 255) as u8
+    })
+}
+
 /// Returns the number at the end of a file name: 12 for `frame_00012.png`.
 fn number_at_end(path: &Path) -> Option<i64> {
     let stem = path.file_stem()?.to_str()?;
@@ -249,6 +328,32 @@ fn number_at_end(path: &Path) -> Option<i64> {
 }
 
 impl PhotoScene {
+    /// Gives each photo without a mask the file of its name in the folder `masks` (`masks_4` for images of `images_4`),
+    /// with or without the ending of the image: `masks/a.jpg.png` (COLMAP) or `masks/a.png`.
+    pub fn find_masks(&mut self, folder: &Path) {
+        let mut is_folder: HashMap<PathBuf, bool> = HashMap::new();
+        for photo in self.photos.iter_mut().filter(|photo| photo.mask.is_none()) {
+            let Ok(below) = photo.path.strip_prefix(folder) else { continue };
+            let mut parts = below.components();
+            let first = parts.next().map(|part| part.as_os_str().to_string_lossy().into_owned()).unwrap_or_default();
+            let (scaled, below) = match parts.as_path() {
+                rest if rest.as_os_str().is_empty() => (String::new(), below),
+                rest => (first.strip_prefix("images").map(ToOwned::to_owned).unwrap_or_default(), rest),
+            };
+            let candidates = [format!("masks{scaled}"), "masks".into()].map(|name| folder.join(name));
+            let Some(masks) =
+                candidates.into_iter().find(|masks| *is_folder.entry(masks.clone()).or_insert_with(|| masks.is_dir()))
+            else {
+                continue;
+            };
+            let beside = masks.join(below);
+            let mut with_ending = beside.clone().into_os_string();
+            with_ending.push(".png");
+            let mut files = [PathBuf::from(with_ending), beside.with_extension("png"), beside].into_iter();
+            photo.mask = files.find(|file| file.is_file());
+        }
+    }
+
     pub fn skip(&mut self, name: impl Into<String>, reason: impl Into<String>) {
         self.missing.push(MissingPhoto { name: name.into(), reason: reason.into() });
     }

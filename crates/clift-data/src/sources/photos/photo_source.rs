@@ -9,6 +9,7 @@ use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::geometry::path_spread::far_cameras;
+use crate::image::codec::has_alpha;
 use crate::scene_source::{SceneSource, is_held_out};
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
@@ -26,12 +27,15 @@ const MAX_NAMED_FRAMES: usize = 10_000;
 const FAR: &str = "whose camera is farther from all others than 20 times the median step";
 
 /// Images that a note counts.
-const COUNTED: [&str; 5] = [
+const COUNTED: [&str; 8] = [
     "without a camera, not used",
     "turned by the EXIF orientation, as the size of the cameras requires",
     "turned with their cameras by the EXIF orientation",
     "with an EXIF orientation that fits the cameras both ways; data.files.poses_from names the pixels of the poses",
     "with an EXIF orientation that is not applied, as it mirrors",
+    "cut to the part of the lens that a pinhole camera can show, at most 120 degrees",
+    "with a mask, whose black pixels get the colour data.background and do not count in loss and metrics",
+    "with an alpha channel, whose transparent pixels get the colour data.background and do not count",
 ];
 
 /// Largest number of scenes, and of bytes of the images of a scene, whose JPEG files are read to find damage.
@@ -188,7 +192,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = scene;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
-    let (mut turns, mut counts) = (Vec::new(), [num_without_camera, 0, 0, 0, 0]);
+    let (mut turns, mut counts) = (Vec::new(), [0; COUNTED.len()]);
+    counts[0] = num_without_camera;
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
     let num_bytes = |photo: &Photo| std::fs::metadata(&photo.path).map_or(0, |metadata| metadata.len());
     let checks_data = checks_data && photos.iter().map(num_bytes).sum::<u64>() <= MAX_CHECKED_BYTES;
@@ -207,10 +212,11 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
                 let is_counted =
                     [turns_pixels && !turn.is_undecided, turns_view && !turn.is_undecided, turn.is_undecided];
                 let is_counted = is_counted.into_iter().chain([turn.is_unused]);
-                counts[1..]
+                counts[1..=4]
                     .iter_mut()
                     .zip(is_counted)
                     .for_each(|(count, is_counted)| *count += usize::from(is_counted));
+                counts[7] += usize::from(has_alpha(&photos[position].path));
             }
             Err(error) => {
                 let reason = match &error {
@@ -269,6 +275,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     };
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
+    counts[5] = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
+    counts[6] = photos.iter().filter(|photo| photo.mask.is_some()).count();
     Ok(Findings { num_frames, unusable, turns, missing, counts, notes, reason })
 }
 
@@ -303,14 +311,21 @@ impl SceneSource for PhotoSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
+        Ok(self.frame_with_coverage(scene, frame)?.0)
+    }
+
+    fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
         let photo = self.photo(scene, frame)?;
-        let decode = || photo.decode(self.key(scene), frame);
-        self.image_cache.as_ref().map_or_else(decode, |cache| cache.scaled(&photo, decode))
+        let decode = || photo.decode(self.options.background, self.key(scene), frame);
+        match &self.image_cache {
+            Some(cache) if !photo.has_coverage() => Ok((cache.scaled(&photo, || Ok(decode()?.0))?, None)),
+            _ => decode(),
+        }
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
-        if photo.undistortion.is_some() || photo.header()?.turn.is_any() {
+        if photo.undistortion.is_some() || photo.has_coverage() || photo.header()?.turn.is_any() {
             return Ok(None);
         }
         photo.read().map(Some)

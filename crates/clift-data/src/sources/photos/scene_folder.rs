@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::{Path, PathBuf};
 
+use clift_core::folder_of;
+
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
 use crate::skip_report::{first_few, plural};
@@ -41,11 +43,12 @@ pub(crate) struct SceneFolder {
 
 impl SceneFolder {
     pub fn read(&self, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
-        let mut scene = match &self.files {
-            SceneFiles::Transforms(path) => read_transforms(path, options),
-            SceneFiles::Colmap { folder, model } => read_colmap(folder, model, options),
-            SceneFiles::Re10kText { cameras, frames } => read_re10k_text(cameras, frames),
-        }?;
+        let (mut scene, folder) = match &self.files {
+            SceneFiles::Transforms(path) => (read_transforms(path, options)?, folder_of(path)),
+            SceneFiles::Colmap { folder, model } => (read_colmap(folder, model, options)?, folder.as_path()),
+            SceneFiles::Re10kText { cameras, frames } => return read_re10k_text(cameras, frames),
+        };
+        scene.find_masks(folder);
         scene.photos.iter_mut().for_each(|photo| photo.poses_from = options.poses_from);
         Ok(scene)
     }

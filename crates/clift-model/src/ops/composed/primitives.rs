@@ -36,6 +36,12 @@ pub(crate) fn mean<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_mul_scalar(B::float_sum_dim(x, last), (1.0 / shape[last] as f64).into())
 }
 
+/// Multiplies matrices in the type of the tensors.
+#[cfg(feature = "wgpu")]
+pub(crate) fn matmul<B: Backend>(lhs: FloatTensor<B>, rhs: FloatTensor<B>) -> FloatTensor<B> {
+    B::float_matmul(lhs, rhs)
+}
+
 /// Returns the factor of the scores of attention, `1 / sqrt(head width)`.
 pub(crate) fn score_scale(dim: usize, num_heads: usize) -> f64 {
     1.0 / ((dim / num_heads) as f64).sqrt()

@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::{Device, Tensor};
 use clift_data::write_state_dict;
 use clift_model::{
-    Cameras, Clift, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, TrainedModel, Views,
+    Cameras, CliftVariant, Clusters, DeviceName, ModelPath, Network, PREFIX, SceneClusters, TrainedModel, Views,
     save_weights,
 };
 use half::f16;
@@ -215,7 +215,7 @@ fn exports_of_new_models_have_the_published_shapes() {
         let (config, _) = import(&published.path, &imported, &options(variant, num_heads)).unwrap();
         // A model that was never imported.
         let weights = place.path().join(format!("{name}.safetensors"));
-        save_weights(&Clift::new(&config.model, 0, &Device::flex()), &weights).unwrap();
+        save_weights(&Network::new(&config.model, 0, &Device::flex()), &weights).unwrap();
         let model = ModelPath { dir: place.path().into(), weights };
         let out = place.path().join(format!("{name}.ckpt"));
         export(&config, &model, ExportFormat::Pytorch, &out).unwrap();

@@ -255,7 +255,7 @@ fn a_rank_without_data_ends_all_and_rank_0_saves_first() {
                 _ => batches.batch(step),
             });
             let start = |_: &mut dyn Sink| Ok(run.new_model());
-            run.plan(Stage::Stage1, batches).train(start, &validation, &AtomicBool::new(false), &mut sink)
+            train_stage(&run.plan(Stage::Stage1, batches), start, &validation, &AtomicBool::new(false), &mut sink)
         };
         ranks.finish(work().map(drop)).unwrap_err().to_string()
     });

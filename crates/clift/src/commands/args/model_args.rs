@@ -94,7 +94,8 @@ impl ModelArgs {
         let has_files = self.overrides.iter().any(|change| change.key.starts_with("data.files"));
         let files = if has_files { self.config.data.files.clone() } else { FileOptions::default() };
         // The filters are for training scenes; the user chooses this scene by its key.
-        let options = SourceOptions { files, ..SourceOptions::default() };
+        let background = self.config.data.background;
+        let options = SourceOptions { files, background, ..SourceOptions::default() };
         let opened = open_source(&DatasetRoot::find(folder)?, split, &options)?;
         if opened.report.has_content() {
             print_note(&format!("{}: {}", folder.display(), opened.report));

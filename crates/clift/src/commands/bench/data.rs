@@ -3,7 +3,6 @@
 use std::path::PathBuf;
 
 use clift_bench::{Throughput, ThroughputOptions, measure_reading};
-use clift_core::{PoseRotation, PoseScale};
 use clift_data::{ClipOptions, FileOptions};
 use clift_eval::{peak_bytes, start_peak, table};
 use serde::Serialize;
@@ -61,13 +60,7 @@ pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
         usage_bail!("no scenes in {}", args.dir.display());
     };
     let [width, height] = args.size;
-    let clip = ClipOptions {
-        width,
-        height,
-        pose_rotation: PoseRotation::default(),
-        pose_scale: PoseScale::default(),
-        exact_principal_point: false,
-    };
+    let clip = ClipOptions { width, height, ..ClipOptions::default() };
     let options = ThroughputOptions {
         clip,
         num_views: args.views,

@@ -6,6 +6,7 @@ use crate::commands::data::check::CheckArgs;
 use crate::commands::data::convert::ConvertArgs;
 use crate::commands::data::index::IndexArgs;
 use crate::commands::data::info::InfoArgs;
+use crate::commands::data::poses::PosesArgs;
 use crate::commands::data::synth::SynthArgs;
 
 /// Commands for data sets.
@@ -28,6 +29,18 @@ Keys of --set for rooms, as in [data.synthetic] of a config: fov_deg,
 room_half_size, num_objects, path_length, texture_frequency, specular,
 samples_per_pixel.")]
     Synth(SynthArgs),
+    /// Find the camera poses of photos or a film with COLMAP
+    ///
+    /// Runs an installed COLMAP (and ffmpeg for a film) with settings for 20 to 200 photos, keeps the largest model, and
+    /// checks it as `clift data check`. Writes CAPTURE/images, CAPTURE/sparse/0 and CAPTURE/colmap, which has COLMAP's log
+    /// and database. Ten photos take about two minutes on two cores, a hundred up to an hour. The same command continues
+    /// an interrupted one.
+    #[command(after_help = "\
+Examples:
+  clift data poses photos/attic -o captures/attic
+  clift data poses attic.mp4 -o captures/attic --frames 150
+  clift data poses photos/walk -o captures/walk --matching neighbours")]
+    Poses(PosesArgs),
     /// Describe a data set, a config's use of it, or an evaluation index
     ///
     /// Recognises every layout: chunks, files per scene, RealEstate10K text files, DL3DV folders, captures with

@@ -171,8 +171,8 @@ fn frames_whose_cameras_cannot_be_used_are_skipped() {
     });
     write_chunks(&folder.path().join("train"), records, u64::MAX).unwrap();
     let whole = source;
-    for max_fov_deg in [None, Some(100.0)] {
-        let filters = SceneFilters { min_frames: 1, max_fov_deg };
+    for (min_frames, max_fov_deg) in [(0, None), (1, None), (1, Some(100.0))] {
+        let filters = SceneFilters { min_frames, max_fov_deg };
         let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
         let scene = source.find("00000000000000a1").unwrap();
         assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 7));

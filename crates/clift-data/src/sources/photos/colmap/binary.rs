@@ -7,9 +7,8 @@ use std::path::Path;
 
 use crate::error::DataError;
 use crate::files::listing::decode_name;
-use crate::sources::photos::colmap::model::{
-    ColmapCamera, ColmapImage, MAX_NAME_BYTES, MODELS, Model, add_camera, add_image,
-};
+use crate::geometry::lens_models::MODELS;
+use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
 
 /// Bytes of an image point: two coordinates and the id of the 3D point.
 const POINT_BYTES: u64 = 24;
@@ -28,9 +27,11 @@ fn read_cameras(path: &Path) -> Result<HashMap<u32, ColmapCamera>, DataError> {
         let model = i32::from_le_bytes(file.take()?);
         let (width, height) = (u64::from_le_bytes(file.take()?), u64::from_le_bytes(file.take()?));
         let known = usize::try_from(model).ok().and_then(|model| MODELS.get(model));
-        let &(name, num_params) =
+        let &(name, num_focal, num_distortion) =
             known.ok_or_else(|| file.bad(format!("camera {index} of {count} has the unknown model {model}")))?;
-        let params = (0..num_params).map(|_| file.take().map(f64::from_le_bytes)).collect::<Result<_, _>>()?;
+        let params = (0..num_focal + 2 + num_distortion)
+            .map(|_| file.take().map(f64::from_le_bytes))
+            .collect::<Result<_, _>>()?;
         let camera = ColmapCamera { model: name.into(), width, height, params };
         add_camera(&mut cameras, id, camera).map_err(|what| file.bad(what))?;
     }

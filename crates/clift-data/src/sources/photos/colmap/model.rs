@@ -7,27 +7,13 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::error::DataError;
 use crate::geometry::lens::Lens;
+use crate::geometry::lens_models::MODELS;
 use crate::sources::photos::photo::MAX_FRAMES;
 
 /// Largest number of cameras of a model: one per image.
 const MAX_CAMERAS: usize = MAX_FRAMES;
 /// Longest name of an image, in bytes.
 pub(crate) const MAX_NAME_BYTES: usize = 4096;
-
-/// Names of COLMAP's camera models and their numbers of parameters, by model id.
-pub(crate) const MODELS: [(&str, usize); 11] = [
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-];
 
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ColmapCamera {
@@ -39,31 +25,29 @@ pub(crate) struct ColmapCamera {
 
 impl ColmapCamera {
     pub fn optics(&self) -> Result<(IntrinsicsNorm, Lens), String> {
-        let (focal, centre, distortion) = match (self.model.as_str(), self.params.as_slice()) {
-            ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 4]),
-            ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], [0.0; 4]),
-            ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], [k, 0.0, 0.0, 0.0]),
-            ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], [k1, k2, 0.0, 0.0]),
-            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => ([fx, fy], [cx, cy], [k1, k2, p1, p2]),
-            (model, params) => {
-                return Err(match MODELS.iter().find(|(name, _)| *name == model) {
-                    Some((_, count)) if *count != params.len() => {
-                        format!("{model} has {} parameters, expected {count}", params.len())
-                    }
-                    _ => format!(
-                        "the model is {model}, expected SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV; \
-                         `colmap image_undistorter` converts every model to PINHOLE"
-                    ),
-                });
-            }
-        };
+        let name = self.model.to_ascii_uppercase();
+        let known = MODELS.iter().find(|(model, num_focal, _)| *model == name && *num_focal > 0);
+        let &(_, num_focal, num_distortion) = known.ok_or_else(|| {
+            let names: Vec<_> =
+                MODELS.iter().filter(|(_, num_focal, _)| *num_focal > 0).map(|(name, ..)| *name).collect();
+            format!("the model is {}, expected one of {}", self.model, names.join(", "))
+        })?;
+        let mut params = self.params.clone();
+        if name == "OPENCV" && params.len() == 6 {
+            params.extend([0.0; 2]); // without tangential terms
+        }
+        let expected = num_focal + 2 + num_distortion;
+        let wrong_number = || format!("{name} has {} parameters, expected {expected}", params.len());
+        if params.len() != expected {
+            return Err(wrong_number());
+        }
+        let (focal, centre) = ([params[0], params[num_focal - 1]], &params[num_focal..num_focal + 2]);
+        let lens = Lens::from_colmap(&name, &params[num_focal + 2..]).ok_or_else(wrong_number)?;
         if self.width == 0 || self.height == 0 {
             return Err(format!("the size is {}x{} pixels", self.width, self.height));
         }
         let intrinsics = Intrinsics { fx: focal[0], fy: focal[1], cx: centre[0], cy: centre[1] };
         let intrinsics_norm = IntrinsicsNorm::from_pixels(intrinsics, self.width as f64, self.height as f64);
-        let [k1, k2, p1, p2] = distortion;
-        let lens = Lens { radial: [k1, k2, 0.0], tangential: [p1, p2] };
         let checked = intrinsics_norm.validate().and_then(|()| lens.validate());
         checked.map(|()| (intrinsics_norm, lens)).map_err(|error| error.to_string())
     }

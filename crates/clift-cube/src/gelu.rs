@@ -1,0 +1,137 @@
+//! GELU with its exact gradient.
+
+use cubecl::ir::ElemType;
+use cubecl::prelude::*;
+
+use crate::buffer::{Buffer, Values};
+use crate::elementwise::{UNITS, elementwise};
+
+/// Returns `exp(-x^2 / 2)`.
+#[cube]
+fn exponential(x: f32) -> f32 {
+    (x * x * -0.5f32).exp()
+}
+
+/// Returns the normal distribution function at `x` from its [`exponential`], with an absolute error below 1e-7 (Abramowitz and
+/// Stegun 7.1.26), without cancellation for negative `x`.
+#[cube]
+fn normal(x: f32, exponential: f32) -> f32 {
+    // 0.3275911 / sqrt(2)
+    let t = 1.0f32 / (1.0f32 + 0.231_641_9f32 * x.abs());
+    let mut sum = fma(t, 1.061_405_4f32, -1.453_152f32);
+    sum = fma(t, sum, 1.421_413_7f32);
+    sum = fma(t, sum, -0.284_496_74f32);
+    sum = fma(t, sum, 0.254_829_6f32);
+    let tail = 0.5f32 * t * sum * exponential;
+    select(x < 0.0f32, tail, 1.0f32 - tail)
+}
+
+/// Computes `x Phi(x)`.
+#[cube]
+pub(crate) fn gelu(x: f32) -> f32 {
+    x * normal(x, exponential(x))
+}
+
+/// Computes `Phi(x) + x phi(x)`.
+#[cube]
+pub(crate) fn gelu_slope(x: f32) -> f32 {
+    let exponential = exponential(x);
+    normal(x, exponential) + x * 0.398_942_3f32 * exponential
+}
+
+#[cube(launch_unchecked)]
+fn forward<X: Float, O: Float, V: Size>(
+    x: &[Vector<X, V>],
+    output: &mut [Vector<O, V>],
+    #[define(X, O)] _types: [ElemType; 2],
+) {
+    let index = ABSOLUTE_POS;
+    if index < x.len() {
+        let mut values = Vector::<f32, V>::cast_from(x[index]);
+        #[unroll]
+        for i in 0..V::value().comptime() {
+            values.insert(i, gelu(values.extract(i)));
+        }
+        output[index] = Vector::cast_from(values);
+    }
+}
+
+#[cube(launch_unchecked)]
+fn backward<X: Float, V: Size>(
+    x: &[Vector<X, V>],
+    grad: &[Vector<f32, V>],
+    grad_x: &mut [Vector<f32, V>],
+    #[define(X)] _types: ElemType,
+) {
+    let index = ABSOLUTE_POS;
+    if index < x.len() {
+        let mut values = Vector::<f32, V>::cast_from(x[index]);
+        #[unroll]
+        for i in 0..V::value().comptime() {
+            values.insert(i, gelu_slope(values.extract(i)));
+        }
+        grad_x[index] = values * grad[index];
+    }
+}
+
+/// Computes `x Phi(x)` with the normal distribution function `Phi`, in type `output`.
+pub fn gelu_forward(client: &Client, x: &Buffer, output: Values) -> Buffer {
+    let output = Buffer::empty(client, x.len, output);
+    let (vector, count) = elementwise(x.len);
+    let types = [x.values.elem(), output.values.elem()];
+    // SAFETY: the kernel compares its index with the length.
+    unsafe {
+        forward::launch_unchecked(
+            client,
+            count,
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            x.arg(vector),
+            output.arg(vector),
+            types,
+        );
+    }
+    output
+}
+
+/// Computes `grad (Phi(x) + x phi(x))` with the normal density `phi`, in f32.
+pub fn gelu_backward(client: &Client, x: &Buffer, grad: &Buffer) -> Buffer {
+    let grad_x = Buffer::empty(client, x.len, Values::F32);
+    let (vector, count) = elementwise(x.len);
+    // SAFETY: the kernel compares its index with the length.
+    unsafe {
+        backward::launch_unchecked(
+            client,
+            count,
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            x.arg(vector),
+            grad.arg(vector),
+            grad_x.arg(vector),
+            x.values.elem(),
+        );
+    }
+    grad_x
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{client, erfc, read, upload, worst};
+
+    #[test]
+    fn gelu_and_its_gradient_equal_f64() {
+        let Some(client) = client() else { return };
+        let x: Vec<f32> = (-60..=60).map(|i| i as f32 / 8.0).collect();
+        let grad: Vec<f32> = x.iter().map(|x| 1.5 - x / 10.0).collect();
+        let [x_, grad_] = [&x, &grad].map(|x| upload(&client, x, Values::F32));
+        let normal = |x: f64| 0.5 * erfc(-x * std::f64::consts::FRAC_1_SQRT_2);
+        let density = |x: f64| (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();
+        let values = x.iter().zip(&grad).map(|(&x, &grad)| (f64::from(x), f64::from(grad)));
+        let (expected, slopes): (Vec<f64>, Vec<f64>) =
+            values.map(|(x, grad)| (x * normal(x), grad * (normal(x) + x * density(x)))).unzip();
+        assert!(worst(&read(&client, &gelu_forward(&client, &x_, Values::F32)), &expected) < 1e-6);
+        assert!(worst(&read(&client, &gelu_forward(&client, &x_, Values::F16)), &expected) < 6e-4);
+        assert!(worst(&read(&client, &gelu_backward(&client, &x_, &grad_)), &slopes) < 1e-6);
+    }
+}

@@ -1,0 +1,141 @@
+//! Transforms of the heads of tokens by their cameras and patch positions (camera-relative attention).
+// T tokens, P parts of a row, H heads, E width of a head
+
+use cubecl::prelude::*;
+
+use crate::buffer::{Buffer, Values};
+use crate::elementwise::UNITS;
+
+/// How a part of a row is transformed. The transform of a token is block-diagonal: on the first half of a head a 4 x 4 matrix,
+/// on the second half rotations.
+#[derive(Clone, Copy, Debug)]
+pub struct PartTransform {
+    /// Whether the matrix is the inverse one.
+    pub inverse: bool,
+    /// Whether the matrix is transposed.
+    pub transposed: bool,
+    /// Whether the angles are negative.
+    pub negative: bool,
+}
+
+/// Transforms the vector `k` of a head, and two pairs of its second half. Bit `part` of `inverse`, `transposed` and `negative`
+/// belongs to a part.
+#[cube(launch_unchecked)]
+fn transform(
+    x: &[f32],
+    transforms: &[f32],
+    output: &mut [f32],
+    num_parts: usize,
+    num_heads: usize,
+    width: usize,
+    inverse: usize,
+    transposed: usize,
+    negative: usize,
+) {
+    let eighth = width / 8;
+    let index = ABSOLUTE_POS;
+    if index < x.len() / 8 {
+        let head = index / eighth;
+        let k = index % eighth;
+        let part = head / num_heads % num_parts;
+        let token = head / (num_heads * num_parts);
+        let first = head * width;
+        let matrix = token * (32 + width / 2) + (inverse >> part) % 2 * 16;
+        let is_transposed = (transposed >> part) % 2 == 1;
+        for j in 0..4usize {
+            let mut sum = 0.0f32;
+            for i in 0..4usize {
+                let entry = select(is_transposed, i * 4 + j, j * 4 + i);
+                sum = fma(transforms[matrix + entry], x[first + i * eighth + k], sum);
+            }
+            output[first + j * eighth + k] = sum;
+        }
+        let sign = select((negative >> part) % 2 == 1, -1.0f32, 1.0f32);
+        let angles = token * (32 + width / 2) + 32;
+        for i in 0..2usize {
+            let pair = k + i * eighth;
+            let cosine = transforms[angles + pair];
+            let sine = sign * transforms[angles + width / 4 + pair];
+            let a = x[first + width / 2 + pair];
+            let b = x[first + width / 2 + width / 4 + pair];
+            output[first + width / 2 + pair] = a * cosine - b * sine;
+            output[first + width / 2 + width / 4 + pair] = a * sine + b * cosine;
+        }
+    }
+}
+
+/// Transforms `x: [tokens, parts, heads, E]` by `transforms: [tokens, 32 + E / 2]`, a matrix, its inverse, and cosine and sine of
+/// `E / 4` angles a token. E is a multiple of eight.
+pub fn transform_heads(
+    client: &Client,
+    parts: &[PartTransform],
+    [num_heads, head_width]: [usize; 2],
+    transforms: &Buffer,
+    x: &Buffer,
+) -> Buffer {
+    let output = Buffer::empty(client, x.len, Values::F32);
+    let bits = |of: fn(&PartTransform) -> bool| {
+        parts.iter().enumerate().map(|(i, part)| usize::from(of(part)) << i).sum::<usize>()
+    };
+    let cubes = (x.len / 8).div_ceil(UNITS);
+    let columns = cubes.clamp(1, 1 << 15);
+    // SAFETY: the kernel compares its index with the length.
+    unsafe {
+        transform::launch_unchecked(
+            client,
+            CubeCount::Static(columns as u32, cubes.div_ceil(columns) as u32, 1),
+            CubeDim::new_1d(UNITS as u32),
+            x.arg(1),
+            transforms.arg(1),
+            output.arg(1),
+            parts.len(),
+            num_heads,
+            head_width,
+            bits(|part| part.inverse),
+            bits(|part| part.transposed),
+            bits(|part| part.negative),
+        );
+    }
+    output
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{client, random, read, upload, worst};
+
+    #[test]
+    fn transforms_equal_f64() {
+        let Some(client) = client() else { return };
+        let parts = [(false, true, true), (true, false, true), (true, true, false)]
+            .map(|(inverse, transposed, negative)| PartTransform { inverse, transposed, negative });
+        for (tokens, num_heads, width) in [(1, 1, 8), (35, 2, 24)] {
+            let x = random(tokens * 3 * num_heads * width, 1);
+            let len = 32 + width / 2;
+            let transforms = random(tokens * len, 2);
+            let [x_, transforms_] = [&x, &transforms].map(|x| upload(&client, x, Values::F32));
+            let output = transform_heads(&client, &parts, [num_heads, width], &transforms_, &x_);
+            let mut expected = vec![0.0; x.len()];
+            for (head, expected) in expected.chunks_exact_mut(width).enumerate() {
+                let part = parts[head / num_heads % 3];
+                let values = &transforms[head / (3 * num_heads) * len..][..len];
+                let x = |i: usize| f64::from(x[head * width + i]);
+                let matrix = &values[if part.inverse { 16 } else { 0 }..];
+                for k in 0..width / 8 {
+                    for j in 0..4 {
+                        let entry = |i: usize| f64::from(matrix[if part.transposed { i * 4 + j } else { j * 4 + i }]);
+                        expected[j * width / 8 + k] = (0..4).map(|i| entry(i) * x(i * width / 8 + k)).sum();
+                    }
+                }
+                for p in 0..width / 4 {
+                    let sign = if part.negative { -1.0 } else { 1.0 };
+                    let (cosine, sine) = (f64::from(values[32 + p]), sign * f64::from(values[32 + width / 4 + p]));
+                    let (a, b) = (width / 2 + p, width / 2 + width / 4 + p);
+                    expected[a] = x(a) * cosine - x(b) * sine;
+                    expected[b] = x(a) * sine + x(b) * cosine;
+                }
+            }
+            assert!(worst(&read(&client, &output), &expected) < 1e-6);
+        }
+    }
+}

@@ -1,0 +1,245 @@
+//! Attention on cooperative matrices: f16 operands, f32 sums.
+//!
+//! A plane has as many rows of one head, queries or, in the backward by keys, keys, as a matrix has, and keeps them in
+//! registers; the cube reads the others in blocks of columns. Scores pass through shared memory, where the plane that made
+//! them turns them into weights.
+// E width of a head
+
+use cubecl::ir::ElemType;
+use cubecl::prelude::*;
+use half::f16;
+
+use crate::head_rows::{Rows, head_of_cube, read_rows};
+use crate::load::Four;
+use crate::matrix_scores::{
+    AttentionTile, Scores, Stage, add_products, column_of_unit, load_rows, mask, max_of_plane, max_of_row, row_of_unit,
+    scale_sums, stage_block, sum_of_row, write_scores, write_sums, zero_sums,
+};
+
+/// How far scores may exceed the maximum by which weights are divided: weights are at most `exp(LEEWAY)`.
+const LEEWAY: f32 = 8.0;
+
+/// Computes the output and the log sums `[batch, heads, queries]`.
+#[cube(launch_unchecked)]
+pub(crate) fn forward<F: Float, V: Size>(
+    query: &[Vector<F, V>],
+    key: &[Vector<F, V>],
+    value: &[Vector<F, V>],
+    output: &mut [Vector<f32, V>],
+    log_sum: &mut [f32],
+    query_rows: Rows,
+    key_rows: Rows,
+    value_rows: Rows,
+    output_rows: Rows,
+    num_heads: usize,
+    scale: f32,
+    #[comptime] tile: AttentionTile,
+    #[define(F)] _values: ElemType,
+) {
+    let head = head_of_cube(num_heads, tile.width);
+    let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
+    let mut stage = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
+    let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
+    let row = row_of_unit(tile);
+    let score_row = row * comptime!(tile.pitches()[2]);
+    let weight_row = row * comptime!(tile.pitches()[1]);
+    let fours = comptime!(tile.fours());
+
+    let mut partial = Shared::<[f32]>::new_slice(comptime!(tile.units()));
+    let queries = load_rows::<F, V>(&mut stage, query, &query_rows, &head, first_row, tile);
+    let mut sums = zero_sums(comptime!(tile.matrices()[1]), tile);
+    let mut values = Array::<Four<f32>>::new(fours);
+    let mut maximum = f32::new(f32::MIN);
+    // Of the unit's columns.
+    let mut total = Four::<f32>::new(0.0);
+
+    let mut first = 0usize;
+    while first < key_rows.count {
+        sync_cube();
+        stage_block::<F, V>(&mut stage, key, &key_rows, &head, first, tile);
+        sync_cube();
+        write_scores(&mut scores, &queries, &stage, tile);
+        sync_cube();
+        stage_block::<F, V>(&mut stage, value, &value_rows, &head, first, tile);
+        let mut largest = f32::new(f32::MIN);
+        #[unroll]
+        for i in 0..fours {
+            let column = column_of_unit(i, tile);
+            values[i] = scores[(score_row + column) / 4] * Four::<f32>::new(scale);
+            #[unroll]
+            for j in 0..4usize {
+                if first + column + j < key_rows.count {
+                    largest = max(largest, values[i].extract(j));
+                }
+            }
+        }
+        // Of all units of the row.
+        largest = max_of_row(&mut partial, largest, tile);
+        if max_of_plane(&mut partial, largest - maximum, tile) > LEEWAY {
+            let raised = max(maximum, largest);
+            let decay = (maximum - raised).exp();
+            maximum = raised;
+            total *= Four::<f32>::new(decay);
+            scale_sums(&mut sums, &mut scores, decay, tile);
+        }
+        #[unroll]
+        for i in 0..fours {
+            let column = column_of_unit(i, tile);
+            let weight = mask((values[i] - Four::<f32>::new(maximum)).exp(), first + column, key_rows.count);
+            total += weight;
+            weights[(weight_row + column) / 4] = Four::<f16>::cast_from(weight);
+        }
+        sync_cube();
+        add_products(&sums, &weights, &stage, tile);
+        first += tile.columns;
+    }
+
+    let mut sum = 0.0f32;
+    #[unroll]
+    for j in 0..4usize {
+        sum += total.extract(j);
+    }
+    sum = sum_of_row(&mut partial, sum, tile);
+    write_sums::<V>(output, &sums, &mut scores, 1.0 / sum, &output_rows, &head, first_row, tile);
+    if UNIT_POS as usize % comptime!(tile.lanes()) == 0 && first_row + row < query_rows.count {
+        log_sum[CUBE_POS_Y as usize * query_rows.count + first_row + row] = maximum + sum.ln();
+    }
+}
+
+/// Computes the gradient of the queries: `dQ = s dS K`, with `dS = P (dO V^T - delta)`.
+#[cube(launch_unchecked)]
+pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
+    query: &[Vector<F, V>],
+    key: &[Vector<F, V>],
+    value: &[Vector<F, V>],
+    grad_output: &[Vector<G, V>],
+    log_sum: &[f32],
+    delta: &[f32],
+    grad_query: &mut [Vector<f32, V>],
+    query_rows: Rows,
+    key_rows: Rows,
+    value_rows: Rows,
+    output_rows: Rows,
+    grad_rows: Rows,
+    num_heads: usize,
+    scale: f32,
+    #[comptime] tile: AttentionTile,
+    #[define(F, G)] _values: [ElemType; 2],
+) {
+    let head = head_of_cube(num_heads, tile.width);
+    let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
+    let mut keys = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut values = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
+    let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
+    let row = row_of_unit(tile);
+    let score_row = row * comptime!(tile.pitches()[2]);
+    let weight_row = row * comptime!(tile.pitches()[1]);
+    let fours = comptime!(tile.fours());
+
+    let queries = load_rows::<F, V>(&mut keys, query, &query_rows, &head, first_row, tile);
+    let grads = load_rows::<G, V>(&mut keys, grad_output, &output_rows, &head, first_row, tile);
+    let sums = zero_sums(comptime!(tile.matrices()[1]), tile);
+    let mut softmax = Array::<Four<f32>>::new(fours);
+    let index = CUBE_POS_Y as usize * query_rows.count + min(first_row + row, query_rows.count - 1);
+    let log = Four::<f32>::new(log_sum[index]);
+    let delta = Four::<f32>::new(delta[index]);
+
+    let mut first = 0usize;
+    while first < key_rows.count {
+        sync_cube();
+        stage_block::<F, V>(&mut keys, key, &key_rows, &head, first, tile);
+        stage_block::<F, V>(&mut values, value, &value_rows, &head, first, tile);
+        sync_cube();
+        write_scores(&mut scores, &queries, &keys, tile);
+        #[unroll]
+        for i in 0..fours {
+            let column = column_of_unit(i, tile);
+            softmax[i] = (scores[(score_row + column) / 4] * Four::<f32>::new(scale) - log).exp();
+        }
+        write_scores(&mut scores, &grads, &values, tile);
+        #[unroll]
+        for i in 0..fours {
+            let column = column_of_unit(i, tile);
+            let slope = softmax[i] * (scores[(score_row + column) / 4] - delta);
+            weights[(weight_row + column) / 4] = Four::<f16>::cast_from(mask(slope, first + column, key_rows.count));
+        }
+        sync_plane();
+        add_products(&sums, &weights, &keys, tile);
+        first += tile.columns;
+    }
+    write_sums::<V>(grad_query, &sums, &mut scores, scale, &grad_rows, &head, first_row, tile);
+}
+
+/// Computes the gradients of keys and values: `dV = P^T dO`, `dK = s dS^T Q`.
+#[cube(launch_unchecked)]
+pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
+    query: &[Vector<F, V>],
+    key: &[Vector<F, V>],
+    value: &[Vector<F, V>],
+    grad_output: &[Vector<G, V>],
+    log_sum: &[f32],
+    delta: &[f32],
+    grad_key_value: &mut [Vector<f32, V>],
+    query_rows: Rows,
+    key_rows: Rows,
+    value_rows: Rows,
+    output_rows: Rows,
+    grad_key_rows: Rows,
+    grad_value_rows: Rows,
+    num_heads: usize,
+    scale: f32,
+    #[comptime] tile: AttentionTile,
+    #[define(F, G)] _values: [ElemType; 2],
+) {
+    let head = head_of_cube(num_heads, tile.width);
+    let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
+    let mut queries = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut grads = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
+    let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
+    let row = row_of_unit(tile);
+    let score_row = row * comptime!(tile.pitches()[2]);
+    let weight_row = row * comptime!(tile.pitches()[1]);
+    let fours = comptime!(tile.fours());
+
+    let keys = load_rows::<F, V>(&mut queries, key, &key_rows, &head, first_row, tile);
+    let values = load_rows::<F, V>(&mut queries, value, &value_rows, &head, first_row, tile);
+    let key_sums = zero_sums(comptime!(tile.matrices()[1]), tile);
+    let value_sums = zero_sums(comptime!(tile.matrices()[1]), tile);
+    let mut softmax = Array::<Four<f32>>::new(fours);
+    let start = CUBE_POS_Y as usize * query_rows.count;
+
+    let mut first = 0usize;
+    while first < query_rows.count {
+        sync_cube();
+        stage_block::<F, V>(&mut queries, query, &query_rows, &head, first, tile);
+        stage_block::<G, V>(&mut grads, grad_output, &output_rows, &head, first, tile);
+        sync_cube();
+        write_scores(&mut scores, &keys, &queries, tile);
+        #[unroll]
+        for i in 0..fours {
+            let column = column_of_unit(i, tile);
+            let log = read_rows(log_sum, start, first + column, query_rows.count);
+            let weight = (scores[(score_row + column) / 4] * Four::<f32>::new(scale) - log).exp();
+            softmax[i] = mask(weight, first + column, query_rows.count);
+            weights[(weight_row + column) / 4] = Four::<f16>::cast_from(softmax[i]);
+        }
+        sync_plane();
+        add_products(&value_sums, &weights, &grads, tile);
+        write_scores(&mut scores, &values, &grads, tile);
+        #[unroll]
+        for i in 0..fours {
+            let column = column_of_unit(i, tile);
+            let delta = read_rows(delta, start, first + column, query_rows.count);
+            let slope = softmax[i] * (scores[(score_row + column) / 4] - delta);
+            weights[(weight_row + column) / 4] = Four::<f16>::cast_from(slope);
+        }
+        sync_plane();
+        add_products(&key_sums, &weights, &queries, tile);
+        first += tile.columns;
+    }
+    write_sums::<V>(grad_key_value, &key_sums, &mut scores, scale, &grad_key_rows, &head, first_row, tile);
+    write_sums::<V>(grad_key_value, &value_sums, &mut scores, 1.0, &grad_value_rows, &head, first_row, tile);
+}

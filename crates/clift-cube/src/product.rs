@@ -1,0 +1,192 @@
+//! Matrix products: batched, of transposed operands, of any sizes.
+// M rows, N columns, K terms of a sum
+
+use cubecl::ir::ElemType;
+use cubecl::prelude::*;
+
+use crate::adapter::{AdapterClass, ProductTile};
+use crate::buffer::{Buffer, Matrices, Values};
+use crate::epilogue::{Epilogue, write_four};
+use crate::load::{Four, LinesLaunch};
+use crate::matrix_product::matrix_product;
+use crate::product_kind::{OperandKind, ProductKind, SizesLaunch};
+use crate::register_product::register_product;
+
+/// Tiles of the output below which the sums are split, so that every processor of a large adapter has work.
+const MIN_TILES: usize = 96;
+/// Fewest stages of a split.
+const MIN_STAGES: usize = 16;
+
+/// A product `lhs rhs` of batches of matrices: `[M, K]` by `[K, N]`, the output `[batch, M, N]`.
+#[derive(Clone, Debug)]
+pub struct Product<'a> {
+    /// Left matrices.
+    pub lhs: Matrices<'a>,
+    /// Right matrices.
+    pub rhs: Matrices<'a>,
+    /// Number of matrices of the output.
+    pub batch: usize,
+    /// M, N and K.
+    pub sizes: [usize; 3],
+    /// Type to which operands are rounded; sums are in f32.
+    pub operands: Values,
+    /// Added to every row of the sums: `[N]` in f32.
+    pub bias: Option<&'a Buffer>,
+    /// Whether GELU is applied after the bias.
+    pub gelu: bool,
+    /// Added last, in f32, in the layout of the output.
+    pub residual: Option<&'a Buffer>,
+    /// Type of the output.
+    pub output: Values,
+}
+
+impl<'a> Product<'a> {
+    /// Returns a product of single matrices in f32, without further steps.
+    pub fn new(lhs: Matrices<'a>, rhs: Matrices<'a>, sizes: [usize; 3]) -> Self {
+        let [operands, output] = [Values::F32; 2];
+        Self { lhs, rhs, batch: 1, sizes, operands, bias: None, gelu: false, residual: None, output }
+    }
+
+    /// Computes the product into a new buffer, with the tile that the table has for the adapter.
+    pub fn run(&self, client: &Client) -> Buffer {
+        self.run_tile(client, AdapterClass::of(client).product_tile(self.operands, self.sizes))
+    }
+
+    /// Computes the product with a tile, which decides the type of the operands.
+    pub fn run_tile(&self, client: &Client, tile: ProductTile) -> Buffer {
+        let [m, n, _] = self.sizes;
+        let output = Buffer::empty(client, self.batch * m * n, self.output);
+        if output.len == 0 {
+            return output;
+        }
+        let epilogue = Epilogue { bias: self.bias.is_some(), gelu: self.gelu, residual: self.residual.is_some() };
+        let splits = self.splits(tile);
+        if splits.count == 1 {
+            self.launch(client, tile, splits, epilogue, &output);
+        } else {
+            let partial = Buffer::empty(client, splits.count * output.len, Values::F32);
+            self.launch(client, tile, splits, Epilogue::default(), &partial);
+            self.add_splits(client, &partial, splits.count, epilogue, &output);
+        }
+        output
+    }
+
+    /// Divides long sums of few tiles.
+    fn splits(&self, tile: ProductTile) -> Splits {
+        let ([m, n, k], [tile_m, tile_n, tile_k]) = (self.sizes, tile.stage());
+        let tiles = self.batch * m.div_ceil(tile_m) * n.div_ceil(tile_n);
+        let count = MIN_TILES.div_ceil(tiles).min(k.div_ceil(tile_k * MIN_STAGES)).max(1);
+        let terms = k.div_ceil(count).next_multiple_of(tile_k);
+        Splits { count: k.div_ceil(terms).max(1), terms }
+    }
+
+    fn launch(&self, client: &Client, tile: ProductTile, splits: Splits, epilogue: Epilogue, output: &Buffer) {
+        let [m, n, k] = self.sizes;
+        let kind = ProductKind {
+            lhs: OperandKind { terms_inner: !self.lhs.transposed },
+            rhs: OperandKind { terms_inner: self.rhs.transposed },
+            epilogue,
+        };
+        let [lhs_width, rhs_width] = [self.lhs.width([m, k]), self.rhs.width([k, n])];
+        let output_width = if n.is_multiple_of(4) { 4 } else { 1 };
+        let lines = |x: &Matrices| LinesLaunch::new(x.start, x.batch_stride, x.stride);
+        let [tile_m, tile_n, _] = tile.stage();
+        let cubes = [n.div_ceil(tile_n), m.div_ceil(tile_m), self.batch * splits.count].map(|count| count as u32);
+        let count = CubeCount::Static(cubes[0], cubes[1], cubes[2]);
+        let dim = CubeDim::new_1d(tile.units() as u32);
+        let [lhs, rhs] = [self.lhs.buffer.arg(lhs_width), self.rhs.buffer.arg(rhs_width)];
+        // A kernel without bias or residual reads nothing of these.
+        let unused = self.lhs.buffer;
+        let bias = self.bias.filter(|_| epilogue.bias).unwrap_or(unused).arg(1);
+        let residual = self.residual.filter(|_| epilogue.residual).unwrap_or(unused).arg(output_width);
+        let (lhs_lines, rhs_lines) = (lines(&self.lhs), lines(&self.rhs));
+        let sizes = SizesLaunch::new(m, n, k, splits.count, splits.terms);
+        let types = [self.lhs.buffer.values, self.rhs.buffer.values, output.values].map(Values::elem);
+        let widths = [lhs_width, rhs_width, output_width];
+        let output = output.arg(output_width);
+        // SAFETY: the kernels read inside the limits of the matrices and write inside the output.
+        unsafe {
+            match tile {
+                ProductTile::Register(tile) => register_product::launch_unchecked(
+                    client, count, dim, widths[0], widths[1], widths[2], lhs, rhs, bias, residual, output, lhs_lines,
+                    rhs_lines, sizes, kind, tile, types,
+                ),
+                ProductTile::Matrix(tile) => matrix_product::launch_unchecked(
+                    client, count, dim, widths[0], widths[1], widths[2], lhs, rhs, bias, residual, output, lhs_lines,
+                    rhs_lines, sizes, kind, tile, types,
+                ),
+            }
+        }
+    }
+
+    fn add_splits(&self, client: &Client, partial: &Buffer, splits: usize, epilogue: Epilogue, output: &Buffer) {
+        let [m, n, _] = self.sizes;
+        let width = if n.is_multiple_of(4) { 4 } else { 1 };
+        let units = 64;
+        let rows = self.batch * m;
+        let unused = partial;
+        // SAFETY: the kernel compares row and column with the sizes.
+        unsafe {
+            add_splits::launch_unchecked(
+                client,
+                CubeCount::Static(n.div_ceil(4 * units) as u32, rows as u32, 1),
+                CubeDim::new_1d(units as u32),
+                width,
+                partial.arg(width),
+                self.bias.unwrap_or(unused).arg(1),
+                self.residual.unwrap_or(unused).arg(width),
+                output.arg(width),
+                m,
+                n,
+                splits,
+                epilogue,
+                output.values.elem(),
+            );
+        }
+    }
+}
+
+/// Splits of the sums, and terms of each.
+#[derive(Clone, Copy)]
+struct Splits {
+    count: usize,
+    terms: usize,
+}
+
+/// Adds the splits `[batch, splits, M, N]` in their order.
+#[cube(launch_unchecked)]
+fn add_splits<O: Float, V: Size>(
+    partial: &[Vector<f32, V>],
+    bias: &[f32],
+    residual: &[Vector<f32, V>],
+    output: &mut [Vector<O, V>],
+    rows: usize,
+    columns: usize,
+    splits: usize,
+    #[comptime] epilogue: Epilogue,
+    #[define(O)] _values: ElemType,
+) {
+    let width = V::value().comptime();
+    let row = CUBE_POS_Y as usize;
+    let column = (CUBE_POS_X as usize * CUBE_DIM as usize + UNIT_POS as usize) * 4;
+    let mut sum = Four::<f32>::new(0.0);
+    for split in 0..splits {
+        let start = ((row / rows * splits + split) * rows + row % rows) * columns;
+        if comptime!(width == 4) {
+            if column < columns {
+                sum += Four::<f32>::cast_from(partial[(start + column) / 4]);
+            }
+        } else {
+            #[unroll]
+            for i in 0..4usize {
+                if column + i < columns {
+                    sum.insert(i, sum.extract(i) + partial[start + column + i].extract(0usize));
+                }
+            }
+        }
+    }
+    write_four::<O, V>(output, bias, residual, sum, 0usize, row, column, row + 1, columns, epilogue);
+}
+
+#[cfg(test)]
+mod tests;

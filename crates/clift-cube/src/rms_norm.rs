@@ -1,0 +1,184 @@
+//! RMS norms of heads, forward and backward.
+
+use cubecl::prelude::*;
+
+use crate::buffer::{Buffer, Values};
+use crate::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
+
+/// Units of a head, and heads of a cube.
+const LANES: usize = 8;
+const HEADS: usize = 32;
+
+/// Rows of heads: queries, keys and values side by side, or fewer of them.
+#[derive(Clone, Copy, Debug)]
+pub struct NormHeads {
+    /// Parts of a row.
+    pub num_parts: usize,
+    /// Heads of a part.
+    pub num_heads: usize,
+    /// Channels of a head.
+    pub head_width: usize,
+    /// Added to the mean square.
+    pub epsilon: f32,
+}
+
+/// Normalizes heads, or computes the gradient: `dx = r (g - y mean(g y))` with `g = dO gamma`. Heads without a norm are copied.
+#[cube(launch_unchecked)]
+fn norm<V: Size>(
+    x: &[Vector<f32, V>],
+    gammas: &[Vector<f32, V>],
+    grad: &[Vector<f32, V>],
+    output: &mut [Vector<f32, V>],
+    inverses: &mut [f32],
+    rows: usize,
+    num_parts: usize,
+    norm_parts: usize,
+    num_heads: usize,
+    epsilon: f32,
+    #[comptime] width: usize,
+    #[comptime] is_gradient: bool,
+) {
+    let mut stage = Shared::<[f32]>::new_slice(HEADS * LANES);
+    let vector = V::value().comptime();
+    let vectors = comptime!(width / vector);
+    let lane = UNIT_POS as usize % LANES;
+    let all_heads = rows * num_parts * num_heads;
+    let index = (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * HEADS + UNIT_POS as usize / LANES;
+    let head = min(index, all_heads - 1);
+    let part = head / num_heads % num_parts;
+    let has_norm = part < norm_parts;
+    let start = head * vectors;
+    let gamma = min(part, norm_parts - 1) * vectors;
+
+    let mut square = Vector::<f32, V>::new(0.0);
+    let mut i = lane;
+    while i < vectors {
+        square += x[start + i] * x[start + i];
+        i += LANES;
+    }
+    let mean = sum_of_row(sum_of_vector(square), &mut stage, LANES) / width as f32;
+    let inverse = 1.0 / (mean + epsilon).sqrt();
+    let scale = Vector::<f32, V>::new(inverse);
+    let mut along = Vector::<f32, V>::new(0.0);
+    if comptime!(is_gradient) {
+        i = lane;
+        while i < vectors {
+            along += grad[start + i] * gammas[gamma + i] * x[start + i] * scale;
+            i += LANES;
+        }
+        along = Vector::<f32, V>::new(sum_of_row(sum_of_vector(along), &mut stage, LANES) / width as f32);
+    }
+    i = lane;
+    while i < vectors {
+        let normal = x[start + i] * scale;
+        if comptime!(is_gradient) {
+            let slope = (grad[start + i] * gammas[gamma + i] - normal * along) * scale;
+            output[start + i] = select(has_norm, slope, grad[start + i]);
+        } else {
+            output[start + i] = select(has_norm, normal * gammas[gamma + i], x[start + i]);
+        }
+        i += LANES;
+    }
+    if comptime!(is_gradient) {
+        if has_norm && lane == 0 {
+            let row = head / (num_heads * num_parts);
+            inverses[row * norm_parts * num_heads + head % (num_heads * num_parts)] = inverse;
+        }
+    }
+}
+
+fn launch(client: &Client, [x, gammas, grad]: [&Buffer; 3], heads: NormHeads, is_gradient: bool) -> [Buffer; 2] {
+    let NormHeads { num_parts, num_heads, head_width, epsilon } = heads;
+    let rows = x.len / (num_parts * num_heads * head_width);
+    let norm_parts = gammas.len / head_width;
+    let vector = if head_width.is_multiple_of(4) { 4 } else { 1 };
+    let output = Buffer::empty(client, x.len, Values::F32);
+    let inverses = Buffer::empty(client, if is_gradient { rows * norm_parts * num_heads } else { 1 }, Values::F32);
+    let cubes = (rows * num_parts * num_heads).div_ceil(HEADS);
+    let columns = cubes.min(1 << 15);
+    // SAFETY: the kernel reads and writes inside the heads.
+    unsafe {
+        norm::launch_unchecked(
+            client,
+            CubeCount::Static(columns as u32, cubes.div_ceil(columns.max(1)) as u32, 1),
+            CubeDim::new_1d((HEADS * LANES) as u32),
+            vector,
+            x.arg(vector),
+            gammas.arg(vector),
+            grad.arg(vector),
+            output.arg(vector),
+            inverses.arg(1),
+            rows,
+            num_parts,
+            norm_parts,
+            num_heads,
+            epsilon,
+            head_width,
+            is_gradient,
+        );
+    }
+    [output, inverses]
+}
+
+/// Computes `x / sqrt(mean(x^2) + epsilon) * gamma` of the heads of the first parts of every row; there are
+/// `gammas.len / head_width` such parts, and the others stay.
+pub fn rms_norm_forward(client: &Client, [x, gammas]: [&Buffer; 2], heads: NormHeads) -> Buffer {
+    let [output, _] = launch(client, [x, gammas, x], heads, false);
+    output
+}
+
+/// Computes the gradients of `x` and the gammas.
+pub fn rms_norm_backward(client: &Client, [x, gammas]: [&Buffer; 2], grad: &Buffer, heads: NormHeads) -> [Buffer; 2] {
+    let NormHeads { num_parts, num_heads, head_width, .. } = heads;
+    let [grad_x, inverses] = launch(client, [x, gammas, grad], heads, true);
+    let stride = num_parts * num_heads * head_width;
+    let sizes = RowSizes { rows: x.len / stride, columns: gammas.len * num_heads, stride };
+    let term = Term::Head { width: head_width };
+    let mut sums = sum_over_rows(client, sizes, grad, [x, &inverses], term, [num_heads, head_width]);
+    [grad_x, sums.remove(0)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{client, random, read, upload, worst};
+
+    #[test]
+    fn norms_of_heads_and_their_gradients_equal_f64() {
+        let Some(client) = client() else { return };
+        for (rows, num_heads, width, norm_parts) in [(70, 2, 12, 2), (3, 1, 96, 1), (5, 3, 37, 3)] {
+            let parts = 3;
+            let len = rows * parts * num_heads * width;
+            let [x, gammas, grad] = [(len, 1), (norm_parts * width, 2), (len, 3)].map(|(len, seed)| random(len, seed));
+            let [x_, gammas_, grad_] = [&x, &gammas, &grad].map(|x| upload(&client, x, Values::F32));
+            let heads = NormHeads { num_parts: parts, num_heads, head_width: width, epsilon: 1e-5 };
+            let output = rms_norm_forward(&client, [&x_, &gammas_], heads);
+            let [grad_x, grad_gammas] = rms_norm_backward(&client, [&x_, &gammas_], &grad_, heads);
+
+            let [mut expected, mut expected_x] = [Vec::new(), Vec::new()];
+            let mut expected_gammas = vec![0.0; norm_parts * width];
+            for head in 0..rows * parts * num_heads {
+                let part = head / num_heads % parts;
+                let line =
+                    |x: &[f32]| -> Vec<f64> { x[head * width..][..width].iter().map(|&x| f64::from(x)).collect() };
+                let (x, grad) = (line(&x), line(&grad));
+                if part >= norm_parts {
+                    expected.extend(x);
+                    expected_x.extend(grad);
+                    continue;
+                }
+                let gamma = |i: usize| f64::from(gammas[part * width + i]);
+                let inverse = 1.0 / (x.iter().map(|x| x * x).sum::<f64>() / width as f64 + 1e-5).sqrt();
+                let along = (0..width).map(|i| grad[i] * gamma(i) * x[i] * inverse).sum::<f64>() / width as f64;
+                for i in 0..width {
+                    expected.push(x[i] * inverse * gamma(i));
+                    expected_x.push((grad[i] * gamma(i) - x[i] * inverse * along) * inverse);
+                    expected_gammas[part * width + i] += grad[i] * x[i] * inverse;
+                }
+            }
+            assert!(worst(&read(&client, &output), &expected) < 3e-6);
+            assert!(worst(&read(&client, &grad_x), &expected_x) < 3e-6);
+            assert!(worst(&read(&client, &grad_gammas), &expected_gammas) < 3e-6);
+        }
+    }
+}

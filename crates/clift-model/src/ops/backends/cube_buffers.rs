@@ -1,0 +1,66 @@
+//! Tensors of `CubeCL` as buffers of `clift-cube`.
+
+use burn::backend::TensorMetadata;
+use burn::tensor::{DType, Shape};
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::tensor::CubeTensor;
+use clift_cube::{Buffer, Matrices, Values};
+
+/// Whether the kernels accept the tensor; f64 and f16 take the composed operations.
+pub(crate) fn is_native(x: &CubeTensor) -> bool {
+    x.dtype == DType::F32 && x.qparams.is_none()
+}
+
+/// Returns the values of a tensor, one after the other.
+pub(crate) fn buffer(x: CubeTensor) -> Buffer {
+    let x = into_contiguous(x);
+    Buffer { len: x.shape().num_elements(), handle: x.handle, values: Values::F32 }
+}
+
+/// Returns a tensor on the device of `like`.
+pub(crate) fn tensor(like: &CubeTensor, x: Buffer, shape: impl Into<Shape>) -> CubeTensor {
+    CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), shape.into(), x.handle, DType::F32)
+}
+
+/// The matrices of the last two dimensions of a tensor.
+pub(crate) struct MatrixBuffer {
+    buffer: Buffer,
+    batch_stride: usize,
+    stride: usize,
+    transposed: bool,
+}
+
+impl MatrixBuffer {
+    /// Reads a tensor where it lies if its rows, or its columns, are whole; copies another.
+    pub(crate) fn new(x: CubeTensor) -> Self {
+        Self::in_place(&x).unwrap_or_else(|| {
+            let contiguous = into_contiguous(x);
+            Self::in_place(&contiguous).expect("a contiguous tensor has rows")
+        })
+    }
+
+    fn in_place(x: &CubeTensor) -> Option<Self> {
+        if x.meta.is_tiled() {
+            return None;
+        }
+        let (shape, strides) = (x.meta.shape(), x.meta.strides());
+        let last = shape.num_dims() - 1;
+        let [rows, columns] = [shape[last - 1], shape[last]];
+        let (stride, transposed) = if strides[last] == 1 && strides[last - 1] >= columns {
+            (strides[last - 1], false)
+        } else if strides[last - 1] == 1 && strides[last] >= rows {
+            (strides[last], true)
+        } else {
+            return None;
+        };
+        let is_batched = (1..last - 1).all(|i| strides[i - 1] == strides[i] * shape[i]);
+        let batch_stride = if last > 1 { strides[last - 2] } else { 0 };
+        let buffer = Buffer { handle: x.handle.clone(), len: shape.num_elements(), values: Values::F32 };
+        is_batched.then_some(Self { buffer, batch_stride, stride, transposed })
+    }
+
+    pub(crate) fn view(&self) -> Matrices<'_> {
+        let &Self { ref buffer, batch_stride, stride, transposed } = self;
+        Matrices { buffer, start: 0, batch_stride, stride, transposed }
+    }
+}
