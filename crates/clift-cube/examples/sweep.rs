@@ -1,6 +1,6 @@
 //! Times every tile of the products, and attention, on an adapter, one JSON object a line:
-//! `cargo run --release -p clift-cube --features spirv --example sweep -- 4` with the divisor of the sizes, 1 for the full
-//! network at batch 4.
+//! `cargo run --release -p clift-cube --features spirv --example sweep -- 4 attention` with the divisor of the sizes, 1 for
+//! the full network at batch 4, and `products` or `attention` for one of the two.
 
 use std::time::{Duration, Instant};
 
@@ -14,10 +14,29 @@ use cubecl::prelude::Client;
 const HEAD_WIDTH: usize = 96;
 
 fn main() {
-    let divisor: usize = std::env::args().nth(1).map_or(1, |text| text.parse().expect("the divisor of the sizes"));
+    let mut arguments = std::env::args().skip(1);
+    let divisor: usize = arguments.next().map_or(1, |text| text.parse().expect("the divisor of the sizes"));
+    let part = arguments.next();
+    let is_part = |name: &str| part.as_deref().is_none_or(|part| part == name);
     let client = Device::Wgpu(cubecl::device::WgpuDevice::default()).client();
     let class = AdapterClass::of(&client);
     println!("{{\"adapter\":\"{}\",\"class\":\"{class:?}\"}}", client.name());
+    if is_part("products") {
+        time_products(&client, class, divisor);
+    }
+    if is_part("attention") {
+        let count = 4096 / divisor;
+        time_attention(&client, count, None);
+        if let AdapterClass::Matrices(shape) = class {
+            for (planes, columns) in [(8, 2), (4, 2), (4, 4), (2, 2)] {
+                let columns = columns * shape.sizes[0];
+                time_attention(&client, count, Some(AttentionTile { shape, planes, columns, width: HEAD_WIDTH }));
+            }
+        }
+    }
+}
+
+fn time_products(client: &Client, class: AdapterClass, divisor: usize) {
     // A projection of queries, keys and values, of the feed-forward network and of attention, at batch 4.
     let layers = [[16_384, 2304, 768], [16_384, 2048, 768], [16_384, 768, 2048], [16_384, 768, 768]];
     for sizes in layers.map(|sizes| sizes.map(|size| size / divisor)) {
@@ -30,16 +49,8 @@ fn main() {
         ];
         for (name, sizes, transposed) in products {
             for tile in tiles(class) {
-                time_product(&client, name, sizes, transposed, tile);
+                time_product(client, name, sizes, transposed, tile);
             }
-        }
-    }
-    let count = 4096 / divisor;
-    time_attention(&client, count, None);
-    if let AdapterClass::Matrices(shape) = class {
-        for (planes, columns) in [(8, 2), (4, 2), (4, 4), (2, 2)] {
-            let columns = columns * shape.sizes[0];
-            time_attention(&client, count, Some(AttentionTile { shape, planes, columns, width: HEAD_WIDTH }));
         }
     }
 }
@@ -67,16 +78,25 @@ fn tiles(class: AdapterClass) -> Vec<ProductTile> {
 }
 
 fn wait(client: &Client) {
-    cubecl::future::block_on(client.sync()).expect("kernels that ran");
+    cubecl::future::block_on(client.sync()).expect("a device that works");
 }
 
-/// Returns the time of the first run, which compiles, and of one of the others.
-fn time(client: &Client, run: impl Fn() -> Vec<Buffer>) -> [Duration; 2] {
+/// Returns the milliseconds of the first run, which compiles, and of one of the others, as fields of an object, or why the
+/// kernel does not run.
+fn time(client: &Client, work: f64, run: impl Fn() -> Vec<Buffer>) -> String {
     wait(client);
     let start = Instant::now();
-    run();
+    let results = run();
     wait(client);
     let first = start.elapsed();
+    // A refused launch is an error of those who read its result.
+    for buffer in results {
+        let end = buffer.handle.size().saturating_sub(256);
+        if let Err(error) = client.read_one(buffer.handle.offset_start(end)) {
+            let line = error.to_string().replace(['"', '\n'], " ");
+            return format!("\"error\":\"{line}\"");
+        }
+    }
     let mut runs = 0;
     let start = Instant::now();
     while runs < 3 || (start.elapsed() < Duration::from_millis(150) && runs < 20) {
@@ -84,7 +104,13 @@ fn time(client: &Client, run: impl Fn() -> Vec<Buffer>) -> [Duration; 2] {
         runs += 1;
         wait(client);
     }
-    [first, start.elapsed() / runs]
+    let again = start.elapsed().as_secs_f64() / f64::from(runs);
+    format!(
+        "\"first_ms\":{:.1},\"ms\":{:.3},\"tflops\":{:.3}",
+        1e3 * first.as_secs_f64(),
+        1e3 * again,
+        1e-12 * work / again
+    )
 }
 
 fn upload(client: &Client, len: usize, values: Values) -> Buffer {
@@ -106,14 +132,8 @@ fn time_product(client: &Client, name: &str, sizes: [usize; 3], transposed: [boo
     };
     let [lhs, rhs] = [view(&lhs, transposed[0], [m, k]), view(&rhs, transposed[1], [k, n])];
     let product = Product { operands, ..Product::new(lhs, rhs, sizes) };
-    let [first, again] = time(client, || vec![product.run_tile(client, tile)]);
-    let rate = 2e-12 * (m * n * k) as f64 / again.as_secs_f64();
-    println!(
-        "{{\"product\":\"{name}\",\"sizes\":{sizes:?},\"tile\":\"{tile:?}\",\"first_ms\":{:.1},\"ms\":{:.3},\
-         \"tflops\":{rate:.2}}}",
-        1e3 * first.as_secs_f64(),
-        1e3 * again.as_secs_f64()
-    );
+    let times = time(client, 2.0 * (m * n * k) as f64, || vec![product.run_tile(client, tile)]);
+    println!("{{\"product\":\"{name}\",\"sizes\":{sizes:?},\"tile\":\"{tile:?}\",{times}}}");
 }
 
 fn time_attention(client: &Client, count: usize, tile: Option<AttentionTile>) {
@@ -124,26 +144,19 @@ fn time_attention(client: &Client, count: usize, tile: Option<AttentionTile>) {
     let packed = upload(client, batch * count * 3 * dim, Values::F32);
     let columns = |part| HeadRows { buffer: &packed, column: part * dim, stride: 3 * dim };
     let inputs = AttentionInputs { query: columns(0), key: columns(1), value: columns(2) };
-    let [first, again] = time(client, || attention_forward_tile(client, sizes, &inputs, tile).into());
-    let work = 4e-12 * (batch * count * count * dim) as f64;
-    let line = |name: &str, work: f64, [first, again]: [Duration; 2]| {
-        println!(
-            "{{\"attention\":\"{name}\",\"tile\":\"{tile:?}\",\"tokens\":{count},\"first_ms\":{:.1},\"ms\":{:.3},\
-             \"tflops\":{:.2}}}",
-            1e3 * first.as_secs_f64(),
-            1e3 * again.as_secs_f64(),
-            work / again.as_secs_f64()
-        );
+    let line = |name: &str, times: String| {
+        println!("{{\"attention\":\"{name}\",\"tile\":\"{tile:?}\",\"tokens\":{count},{times}}}");
     };
-    line("forward", work, [first, again]);
+    let work = 4.0 * (batch * count * count * dim) as f64;
+    line("forward", time(client, work, || attention_forward_tile(client, sizes, &inputs, tile).into()));
     let [output, log_sum] = attention_forward_tile(client, sizes, &inputs, tile);
     let results = AttentionResults { output: &output, log_sum: &log_sum, grad_output: &output };
-    let times = time(client, || {
+    let times = time(client, 2.5 * work, || {
         let grad = Buffer::empty(client, packed.len, Values::F32);
         let columns = |part| HeadRows { buffer: &grad, column: part * dim, stride: 3 * dim };
         let grads = AttentionInputs { query: columns(0), key: columns(1), value: columns(2) };
         attention_backward_tile(client, sizes, &inputs, results, &grads, tile);
         vec![grad]
     });
-    line("backward", 2.5 * work, times);
+    line("backward", times);
 }
