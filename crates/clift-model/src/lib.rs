@@ -112,7 +112,7 @@ pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
 pub use network::layers::Part;
 // Metrics of images, and the perceptual loss
-pub use metrics::image_metrics::{SSIM_MIN_SIZE_PX, check_images, psnr, psnr_of_mse, ssim};
+pub use metrics::image_metrics::{SSIM_MIN_SIZE_PX, check_images, psnr, psnr_of_mse, sharpness, ssim};
 pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
 pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
 pub use metrics::vgg::{Pooling, VggShape, VggSizes};

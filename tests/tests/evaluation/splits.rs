@@ -1,5 +1,7 @@
 //! What the figures of an evaluation were measured on: splits, held-out frames, targets that are also contexts.
 
+use std::collections::BTreeSet;
+
 use clift_data::{ImageEncoding, SyntheticConfig, SyntheticSource, read_scene, write_chunks};
 use serde_json::json;
 
@@ -46,6 +48,20 @@ fn runs_without_test_split_are_measured_on_held_out_frames() {
     // What was held out is a matter of training: the evaluation does not change it.
     place.eval("run --set data.hold_out=3 --out DIR/same").ok();
     assert_eq!(target_frames(&place, "same"), target_frames(&place, "run/eval"));
+
+    // Weights beside the data, without the knowledge of what was held out.
+    let foreign = "eval --checkpoint DIR/run/stage1 --data REPO/data-fixtures/re10k-mini/train --out DIR/";
+    place.clift(&format!("{foreign}all")).ok();
+    place
+        .clift(&format!("{foreign}held-out --set data.hold_out=4"))
+        .ok()
+        .prints(" context views, rendered from all tokens");
+    let distinct = |eval: &str| target_frames(&place, eval).into_iter().collect::<BTreeSet<_>>();
+    assert_eq!(distinct("held-out"), distinct("run/eval"), "the methods differ, as stage 1 has fewer");
+    assert!(target_frames(&place, "all").iter().any(|frame| frame % 4 != 0));
+    let contexts = |eval: &str| place.json(&format!("{eval}/summary.json"))["context_frames"].clone();
+    assert_eq!(contexts("held-out"), contexts("run/eval"));
+    assert_ne!(contexts("held-out"), contexts("all"));
 
     place.train("overfit --overfit 1", &set).ok().prints("(training scenes)").prints(warning);
     assert_eq!(place.json("overfit/eval/summary.json")["split"], "train");

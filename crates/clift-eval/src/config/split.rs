@@ -42,7 +42,7 @@ impl fmt::Display for EvalSplit {
 pub struct EvalFrames {
     /// The evaluated split.
     pub split: EvalSplit,
-    /// Every n-th frame of a scene is held out of training; 0 for none.
+    /// Every n-th frame of a scene is held out of training, or of the contexts of a data set without splits; 0 for none.
     pub hold_out: usize,
 }
 
@@ -78,7 +78,7 @@ impl EvalFrames {
         }
         let held_out = source.held_out(scene, self.hold_out)?;
         let rest: Vec<usize> = (0..num_frames).filter(|frame| held_out.binary_search(frame).is_err()).collect();
-        let targets = (self.split == EvalSplit::HeldOutFrames).then_some(&held_out[..]);
+        let targets = (self.split != EvalSplit::Train).then_some(&held_out[..]);
         Ok(even_views_of(&rest, targets, num_context, num_targets))
     }
 
@@ -105,6 +105,7 @@ mod tests {
             |num_frames| SyntheticSource::new(SyntheticConfig { num_frames, ..SyntheticConfig::default() }).unwrap();
         let views = |split| EvalFrames { split, hold_out: 8 }.views(&rooms(50), 0, 4, 3).unwrap().unwrap();
         let held_out = views(EvalSplit::HeldOutFrames);
+        assert_eq!(held_out, views(EvalSplit::OtherData), "as a run on this data would");
         assert!(held_out.target.iter().all(|frame| frame % 8 == 0) && held_out.target.len() == 3);
         let train = views(EvalSplit::Train);
         assert!(held_out.context.iter().chain(&train.context).chain(&train.target).all(|frame| frame % 8 != 0));

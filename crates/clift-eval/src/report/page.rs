@@ -31,8 +31,9 @@ const SELECTION_NOTE: &str = "For views rendered from fewer tokens than stored, 
                               target and rings mark the other stored tokens.";
 
 const FOOTNOTE: &str = "PSNR: images clamped to [0, 1]. SSIM: Gaussian window of 11 taps. LPIPS: version 0.1 with \
-                        VGG-16. Means are over the views of a scene, then over scenes; \u{b1} is the standard error \
-                        over scenes. A dash: not measured. Times are of this machine, including other load.";
+                        VGG-16. Sharpness: mean gradient of the luminance over that of the target. Means are over \
+                        the views of a scene, then over scenes; \u{b1} is the standard error over scenes. A dash: not \
+                        measured. Times are of this machine, including other load.";
 
 /// Description of the evaluated run for the report.
 #[derive(Clone, Debug)]

@@ -10,7 +10,7 @@ use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::system::machine::machine_rows;
 
-const POINTS_HEAD: [&str; 19] = [
+const POINTS_HEAD: [&str; 20] = [
     "method",
     "stored\ntokens",
     "rendered\ntokens",
@@ -19,6 +19,7 @@ const POINTS_HEAD: [&str; 19] = [
     "\u{b1}\ndB",
     "SSIM\n\u{a0}",
     "LPIPS\n\u{a0}",
+    "sharp-\nness",
     "render\nms",
     "p95\nms",
     "frame\nms",
@@ -62,7 +63,8 @@ pub fn points(summary: &Summary) -> Markup {
                 td {}
                 td { (number(quality.ssim, 3)) }
                 td { (number(quality.lpips_vgg, 3)) }
-                @for _ in 8..POINTS_HEAD.len() { td {} }
+                td { (number(quality.sharpness, 2)) }
+                @for _ in 9..POINTS_HEAD.len() { td {} }
             }
         }
         @for (i, point) in points.iter().enumerate() {
@@ -91,7 +93,7 @@ pub fn points(summary: &Summary) -> Markup {
 }
 
 /// Returns the cells of a point after the method.
-fn cells(point: &SummaryPoint) -> [String; 18] {
+fn cells(point: &SummaryPoint) -> [String; 19] {
     let tokens = |tokens: usize| if tokens == 0 { DASH.to_owned() } else { count(tokens) };
     let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
     let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
@@ -103,6 +105,7 @@ fn cells(point: &SummaryPoint) -> [String; 18] {
         number(point.psnr_stderr, 2),
         number(point.quality.ssim, 3),
         number(point.quality.lpips_vgg, 3),
+        number(point.quality.sharpness, 2),
         ms(point.render_median_s),
         ms(point.render_p95_s),
         ms(point.frame_median_s),

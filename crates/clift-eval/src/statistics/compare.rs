@@ -11,7 +11,7 @@ use crate::error::EvalError;
 use crate::statistics::csv_files::read_views;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
 use crate::statistics::metric_difference::{MetricDifference, common_views};
-use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SSIM};
+use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SHARPNESS, SSIM};
 
 /// The metrics of every view of an evaluation.
 #[derive(Clone, Debug)]
@@ -83,6 +83,8 @@ pub struct PairedRow {
     pub ssim: Option<MetricDifference>,
     /// Difference of LPIPS; lower is better.
     pub lpips_vgg: Option<MetricDifference>,
+    /// Difference of sharpness.
+    pub sharpness: Option<MetricDifference>,
 }
 
 /// A comparison of two evaluations.
@@ -169,6 +171,7 @@ impl PairedRow {
             psnr: MetricDifference::new(&common, PSNR),
             ssim: MetricDifference::new(&common, SSIM),
             lpips_vgg: MetricDifference::new(&common, LPIPS),
+            sharpness: MetricDifference::new(&common, SHARPNESS),
         }
     }
 }

@@ -9,7 +9,8 @@ use crate::statistics::text_table::table;
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "A: {}\nB: {}\n", self.a.display(), self.b.display())?;
-        let header = ["method", "scenes", "PSNR of A", "B - A, dB (95 %)", "B - A, SSIM (95 %)", "B - A, LPIPS (95 %)"];
+        let metrics = ["dB", "SSIM", "LPIPS", "sharpness"].map(|metric| format!("B - A, {metric} (95 %)"));
+        let header = ["method", "scenes", "PSNR of A", &metrics[0], &metrics[1], &metrics[2], &metrics[3]];
         writeln!(f, "{}", table(header, self.pairs.iter().map(cells)))?;
         writeln!(
             f,
@@ -39,7 +40,7 @@ impl fmt::Display for Comparison {
     }
 }
 
-fn cells(pair: &PairedRow) -> [String; 6] {
+fn cells(pair: &PairedRow) -> [String; 7] {
     [
         if pair.a == pair.b { pair.a.to_string() } else { format!("{} -> {}", pair.a, pair.b) },
         pair.num_scenes.to_string(),
@@ -47,6 +48,7 @@ fn cells(pair: &PairedRow) -> [String; 6] {
         interval(pair.psnr, 3),
         interval(pair.ssim, 4),
         interval(pair.lpips_vgg, 4),
+        interval(pair.sharpness, 3),
     ]
 }
 

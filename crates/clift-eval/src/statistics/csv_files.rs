@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SSIM, ViewMetrics, view_mean};
+use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SHARPNESS, SSIM, ViewMetrics, view_mean};
 
 /// A row of `views.csv`.
 #[derive(Serialize, Deserialize)]
@@ -22,6 +22,7 @@ struct ViewRow {
     psnr: f64,
     ssim: Option<f64>,
     lpips_vgg: Option<f64>,
+    sharpness: Option<f64>,
     render_s: Option<f64>,
     select_s: Option<f64>,
     tokens: Option<TokenCoding>,
@@ -39,6 +40,8 @@ struct SceneRow<'a> {
     psnr: Option<f64>,
     ssim: Option<f64>,
     lpips_vgg: Option<f64>,
+    sharpness: Option<f64>,
+    context_frames: Option<String>,
 }
 
 /// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
@@ -47,7 +50,7 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
         let EvalKey { method, num_storage_tokens, num_render_tokens, tokens } = key;
         let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
         views.map(move |(scene, (&target_frame, view))| {
-            let ViewMetrics { psnr, ssim, lpips_vgg, render_s, select_s } = *view;
+            let ViewMetrics { psnr, ssim, lpips_vgg, sharpness, render_s, select_s } = *view;
             let scene = scene.clone();
             ViewRow {
                 scene,
@@ -58,6 +61,7 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
                 psnr,
                 ssim,
                 lpips_vgg,
+                sharpness,
                 render_s,
                 select_s,
                 tokens,
@@ -77,9 +81,9 @@ pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
     for row in csv::Reader::from_path(path).map_err(bad)?.deserialize() {
         let row: ViewRow = row.map_err(bad)?;
         let ViewRow { method, num_storage_tokens, num_render_tokens, tokens, .. } = row;
-        let ViewRow { psnr, ssim, lpips_vgg, render_s, select_s, .. } = row;
+        let ViewRow { psnr, ssim, lpips_vgg, sharpness, render_s, select_s, .. } = row;
         let key = EvalKey { method, num_storage_tokens, num_render_tokens, tokens };
-        let view = ViewMetrics { psnr, ssim, lpips_vgg, render_s, select_s };
+        let view = ViewMetrics { psnr, ssim, lpips_vgg, sharpness, render_s, select_s };
         if !results.add(&row.scene, row.target_frame, key, view) {
             let reason = format!("frame {} of scene {} has two rows of {}", row.target_frame, row.scene, method.name());
             return Err(EvalError::NotComparable { reason, path: path.into() });
@@ -88,7 +92,8 @@ pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
     Ok(results)
 }
 
-/// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene.
+/// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene and its context
+/// frames.
 pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
         scenes.iter().map(move |(scene, views)| SceneRow {
@@ -101,6 +106,11 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
             psnr: view_mean(views, PSNR),
             ssim: view_mean(views, SSIM),
             lpips_vgg: view_mean(views, LPIPS),
+            sharpness: view_mean(views, SHARPNESS),
+            context_frames: results
+                .context_frames
+                .get(scene)
+                .map(|frames| frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")),
         })
     });
     write(path, rows).map_err(EvalError::io("writing the means of the scenes", path))
@@ -121,8 +131,9 @@ mod tests {
 
     #[test]
     fn rows_have_a_fixed_order() {
+        let (sharpness, render_s) = (Some(0.875), Some(0.25));
         let measured =
-            |psnr, lpips_vgg| ViewMetrics { lpips_vgg, render_s: Some(0.25), ..ViewMetrics::quality(psnr, Some(0.5)) };
+            |psnr, lpips_vgg| ViewMetrics { lpips_vgg, sharpness, render_s, ..ViewMetrics::quality(psnr, Some(0.5)) };
         let rows = [
             ("room, \"big\"", 3, CLIFT, measured(f64::INFINITY, None)),
             ("attic", 9, CLIFT, measured(20.0, Some(0.25))),
@@ -130,22 +141,23 @@ mod tests {
             ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.5, None)),
         ];
         let views = "\
-scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens
-attic,2,clift,64,32,23.0,0.5,0.75,0.25,,f16
-attic,9,clift,64,32,20.0,0.5,0.25,0.25,,f16
-\"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.25,,f16
-attic,9,nearest_view,0,0,18.5,,,,,
+scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,sharpness,render_s,select_s,tokens
+attic,2,clift,64,32,23.0,0.5,0.75,0.875,0.25,,f16
+attic,9,clift,64,32,20.0,0.5,0.25,0.875,0.25,,f16
+\"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.875,0.25,,f16
+attic,9,nearest_view,0,0,18.5,,,,,,
 ";
         let scenes = "\
-scene,method,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg
-attic,clift,64,32,f16,2,21.5,0.5,0.5
-\"room, \"\"big\"\"\",clift,64,32,f16,1,100.0,0.5,
-attic,nearest_view,0,0,,1,18.5,,
+scene,method,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg,sharpness,context_frames
+attic,clift,64,32,f16,2,21.5,0.5,0.5,0.875,0 5 12
+\"room, \"\"big\"\"\",clift,64,32,f16,1,100.0,0.5,,0.875,
+attic,nearest_view,0,0,,1,18.5,,,,0 5 12
 ";
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.csv");
         for order in [[0, 1, 2, 3], [3, 2, 1, 0]] {
             let mut results = EvalResults::default();
+            results.context_frames.insert("attic".into(), vec![0, 5, 12]);
             for (scene, frame, key, view) in order.map(|i| rows[i]) {
                 results.add(scene, frame, key, view);
             }
@@ -154,7 +166,7 @@ attic,nearest_view,0,0,,1,18.5,,
             write_scenes(&results, &path).unwrap();
             assert_eq!(std::fs::read_to_string(&path).unwrap(), scenes);
         }
-        std::fs::write(&path, format!("{views}attic,2,clift,64,32,24.0,0.5,0.75,0.25,,f16\n")).unwrap();
+        std::fs::write(&path, format!("{views}attic,2,clift,64,32,24.0,0.5,0.75,,0.25,,f16\n")).unwrap();
         let message = read_views(&path).unwrap_err().to_string();
         assert!(message.contains("frame 2 of scene attic has two rows of clift"), "{message}");
     }

@@ -18,6 +18,15 @@ pub struct NotMeasured {
     pub reason: String,
 }
 
+/// Context views that were rendered themselves.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ContextCheck {
+    /// Rendered context views.
+    pub num_views: usize,
+    /// Those that came out as fog: below [`MIN_CONTEXT_PSNR`](clift_scene::MIN_CONTEXT_PSNR) or the mean of the contexts.
+    pub num_fog: usize,
+}
+
 /// The views of one key, by scene and target frame.
 pub type SceneViews = BTreeMap<String, BTreeMap<usize, ViewMetrics>>;
 
@@ -41,6 +50,10 @@ pub struct EvalResults {
     pub(crate) split: Option<EvalSplit>,
     /// Scene and frame of the targets that are also contexts.
     pub(crate) context_targets: BTreeSet<(String, usize)>,
+    /// Context frames of every measured scene.
+    pub(crate) context_frames: BTreeMap<String, Vec<usize>>,
+    /// The rendered context views of all scenes; `None` without [`Sweep::checks_contexts`](crate::Sweep::checks_contexts).
+    pub(crate) context_check: Option<ContextCheck>,
     /// Keys of the scenes that the models were trained on.
     pub(crate) training_scenes: BTreeSet<String>,
     /// Share of the pixels that masks leave out, of targets with a mask, by scene and frame.
@@ -85,6 +98,10 @@ impl EvalResults {
         self.not_measured.extend(other.not_measured);
         self.selection = self.selection.or(other.selection);
         self.context_targets.extend(other.context_targets);
+        self.context_frames.extend(other.context_frames);
+        if let Some(check) = other.context_check {
+            self.add_context_check(check);
+        }
         self.masked.extend(other.masked);
     }
 
@@ -110,6 +127,13 @@ impl EvalResults {
         let sizes = self.coded_bytes.entry(key).or_default();
         sizes.push(bytes);
         self.costs.entry(key).or_default().coded_bytes = Some(mean(sizes));
+    }
+
+    /// Adds the rendered context views of a scene.
+    pub(crate) fn add_context_check(&mut self, check: ContextCheck) {
+        let sum = self.context_check.get_or_insert_default();
+        sum.num_views += check.num_views;
+        sum.num_fog += check.num_fog;
     }
 
     /// Records why a metric is not measured.
@@ -138,12 +162,16 @@ mod tests {
             let mut part = EvalResults::default();
             part.add(scene, 1, CLIFT, ViewMetrics::quality(f64::INFINITY, None));
             part.add_scene_bytes(CLIFT, bytes);
+            part.context_frames.insert(scene.into(), vec![0, 2]);
+            part.add_context_check(ContextCheck { num_views: 2, num_fog: 1 });
             part
         };
         let mut whole = part("attic", 10);
         whole.merge(part("cellar", 20));
         assert_eq!(whole.of(CLIFT).unwrap().len(), 2);
         assert_eq!(whole.costs[&CLIFT].scene_bytes, Some(15));
+        assert_eq!(whole.context_frames.len(), 2);
+        assert_eq!(whole.context_check, Some(ContextCheck { num_views: 4, num_fog: 2 }));
     }
 
     #[test]

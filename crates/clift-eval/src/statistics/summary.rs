@@ -8,17 +8,18 @@ use std::path::Path;
 
 use clift_core::{mean, median, p95, quartiles, replace_file, standard_error};
 use clift_data::plural;
+use clift_scene::MIN_CONTEXT_PSNR;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
-use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
+use crate::statistics::eval_results::{ContextCheck, EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
 use crate::statistics::view_metrics::{
-    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SSIM, ViewMetrics, best_method, view_mean,
+    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SHARPNESS, SSIM, ViewMetrics, best_method, view_mean,
 };
 
 /// Means over the views of a scene, then over scenes.
@@ -30,6 +31,8 @@ pub struct Quality {
     pub ssim: Option<f64>,
     /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
+    /// Mean over scenes of the scene's mean sharpness.
+    pub sharpness: Option<f64>,
     /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
 }
@@ -69,6 +72,8 @@ pub struct SummaryPoint {
     pub ssim_per_view: Option<f64>,
     /// Mean LPIPS over all views.
     pub lpips_vgg_per_view: Option<f64>,
+    /// Mean sharpness over all views.
+    pub sharpness_per_view: Option<f64>,
     /// Mean rendering time per view, in seconds.
     pub render_s: Option<f64>,
     /// Median rendering time per view, in seconds.
@@ -117,6 +122,10 @@ pub struct Summary {
     pub split: Option<EvalSplit>,
     /// Target views that are also contexts: the input holds their images.
     pub num_context_targets: usize,
+    /// Context frames by scene.
+    pub context_frames: BTreeMap<String, Vec<usize>>,
+    /// The context views, rendered from all tokens; `null` on the data of a run's own training.
+    pub context_check: Option<ContextCheck>,
     /// Scenes that the models were trained on.
     pub training_scenes: BTreeSet<String>,
     /// Share of the target pixels that masks leave out of the metrics; `null` without masks.
@@ -165,6 +174,8 @@ impl Summary {
             num_skipped: results.skipped.len(),
             split: results.split,
             num_context_targets: results.context_targets.len(),
+            context_frames: results.context_frames.clone(),
+            context_check: results.context_check,
             training_scenes: results.training_scenes.clone(),
             masked_share: (!results.masked.is_empty()).then(|| masked / views.len().max(1) as f64),
             selection: results.selection,
@@ -181,7 +192,7 @@ impl Summary {
     pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
         let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);
         let split = split.into_iter().chain(training_scenes_note(&self.training_scenes));
-        split.chain(context_targets_note(self.num_context_targets))
+        split.chain(context_targets_note(self.num_context_targets)).chain(self.context_check.and_then(fog_note))
     }
 
     /// Returns the points of the main method in its finest number format.
@@ -224,6 +235,17 @@ pub(crate) fn context_targets_note(num_given: usize) -> Option<String> {
     })
 }
 
+/// Returns the warning about context views that come out as fog; `None` for no such view.
+fn fog_note(ContextCheck { num_views, num_fog }: ContextCheck) -> Option<String> {
+    (num_fog > 0).then(|| {
+        format!(
+            "{num_fog} of {num_views} context views, rendered from all tokens, are below {MIN_CONTEXT_PSNR} dB or worse than \
+             the mean image, as fog: the contexts of a scene are too far apart for the model; choose nearer ones with \
+             --index, or train on the data set (configs/capture.toml)"
+        )
+    })
+}
+
 /// Returns the mean over the views of each scene, for the scenes that have a value.
 fn scene_means(views: &SceneViews, metric: Metric) -> Vec<f64> {
     views.values().filter_map(|frames| view_mean(frames, metric)).collect()
@@ -235,6 +257,7 @@ impl Quality {
             psnr: mean(&scene_means(views, PSNR)),
             ssim: mean(&scene_means(views, SSIM)),
             lpips_vgg: mean(&scene_means(views, LPIPS)),
+            sharpness: mean(&scene_means(views, SHARPNESS)),
             num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
         }
     }
@@ -254,6 +277,7 @@ impl SummaryPoint {
             psnr_per_view: per_view(PSNR),
             ssim_per_view: per_view(SSIM),
             lpips_vgg_per_view: per_view(LPIPS),
+            sharpness_per_view: per_view(SHARPNESS),
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
             render_p95_s: statistic(&render_s, p95),
@@ -335,11 +359,15 @@ mod tests {
 
     #[test]
     fn the_file_has_the_documented_names() {
-        let mut views = results(&[("a", 0, 20.0)]);
+        let mut views = EvalResults::default();
+        let measured = ViewMetrics { sharpness: Some(0.75), ..ViewMetrics::quality(20.0, Some(0.2)) };
+        views.add("a", 0, CLIFT, measured);
         let copy = ViewMetrics::quality(f64::INFINITY, Some(1.0));
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
         views.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
+        views.context_frames.insert("a".into(), vec![0, 4]);
+        views.add_context_check(ContextCheck { num_views: 2, num_fog: 1 });
         views.training_scenes.insert("a".into());
         views.masked.insert("a".into(), [(0, 0.25)].into());
         let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
@@ -350,30 +378,46 @@ mod tests {
         let summary = Summary::new(&views);
         summary.write(&folder.path().join("summary.json")).unwrap();
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
+        let point = serde_json::json!({
+            "method": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
+            "num_views": 1, "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
+            "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
+            "sharpness": 0.75, "sharpness_per_view": 0.75,
+            "render_s": null, "render_median_s": null, "render_p95_s": null,
+            "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
+            "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "coded_bytes": null, "peak_bytes": null,
+            "pareto_time": false, "pareto_bytes": true
+        });
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
+            "context_frames": {"a": [0, 4]}, "context_check": {"num_views": 2, "num_fog": 1},
             "training_scenes": ["a"],
             "masked_share": 0.25,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],
             "baselines": {
-                "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "num_identical_views": 1},
-                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "num_identical_views": 0}
+                "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "sharpness": null, "num_identical_views": 1},
+                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "sharpness": null, "num_identical_views": 0}
             },
-            "points": [{
-                "method": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
-                "num_views": 1, "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
-                "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
-                "render_s": null, "render_median_s": null, "render_p95_s": null,
-                "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
-                "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "coded_bytes": null, "peak_bytes": null,
-                "pareto_time": false, "pareto_bytes": true
-            }],
+            "points": [point],
             "differences": []
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), summary);
+    }
+
+    #[test]
+    fn fog_is_counted_in_a_warning() {
+        for (num_fog, expected) in
+            [(3, Some("3 of 8 context views, rendered from all tokens, are below 23 dB")), (0, None)]
+        {
+            let mut views = results(&[("a", 0, 20.0)]);
+            views.add_context_check(ContextCheck { num_views: 8, num_fog });
+            let warning = Summary::new(&views).warnings().next();
+            assert_eq!(warning.is_some(), expected.is_some(), "{warning:?}");
+            assert!(warning.unwrap_or_default().starts_with(expected.unwrap_or_default()));
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use crate::statistics::text_table::table;
 /// Largest number of missing images in the table; `summary.json` has all.
 const MAX_NAMED: usize = 3;
 
-const HEADER: [&str; 15] = [
+const HEADER: [&str; 16] = [
     "method",
     "stored",
     "rendered",
@@ -21,6 +21,7 @@ const HEADER: [&str; 15] = [
     "+- dB",
     "SSIM",
     "LPIPS",
+    "sharp",
     "render ms",
     "frame ms",
     "half ms",
@@ -77,13 +78,13 @@ impl fmt::Display for Summary {
 }
 
 fn baseline_cells(method: Method, quality: Quality, num_views: usize) -> [String; HEADER.len()] {
-    let Quality { psnr, ssim, lpips_vgg, num_identical_views } = quality;
+    let Quality { psnr, ssim, lpips_vgg, sharpness, num_identical_views } = quality;
     let mut cells = HEADER.map(|_| cell(None, 0));
     cells[0] = method.name().into();
-    (cells[4], cells[6], cells[7]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
+    (cells[4], cells[6], cells[7], cells[8]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3), cell(sharpness, 2));
     let has_copies = num_identical_views > 0;
     let copies = has_copies.then(|| format!("{num_identical_views} of {num_views} views identical to the target"));
-    cells[14] = copies.unwrap_or_default();
+    cells[15] = copies.unwrap_or_default();
     cells
 }
 
@@ -100,6 +101,7 @@ fn point_cells(point: &SummaryPoint) -> [String; HEADER.len()] {
         cell(point.psnr_stderr, 2),
         cell(point.quality.ssim, 3),
         cell(point.quality.lpips_vgg, 3),
+        cell(point.quality.sharpness, 2),
         ms(point.render_median_s),
         ms(point.frame_median_s),
         quartiles.unwrap_or_else(|| cell(None, 0)),
@@ -130,6 +132,7 @@ mod tests {
         let key = EvalKey { tokens: Some(TokenCoding::INT8), ..CLIFT };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
             let measured = ViewMetrics {
+                sharpness: Some(psnr / 25.0),
                 render_s: Some(ms * 1e-3),
                 select_s: Some(0.01),
                 ..ViewMetrics::quality(psnr, Some(psnr / 100.0))
@@ -148,11 +151,11 @@ mod tests {
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
 
-method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  render ms  frame ms  half ms     GMAC  values  scene kB
-nearest_view  -       -         -       18.00    -      0.500  -      -          -         -           -     -       -
-mean_image    -       -         -       -        -      -      -      -          -         -           -     -       -
-clift         64      32        int8    20.50    0.50   0.205  -      1.5        11.5      11.2..11.8  45.2  49152   99.0      tb
-DepthSplat    -       -         -       19.00    -      -      0.250  -          -         -           -     -       -
+method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  sharp  render ms  frame ms  half ms     GMAC  values  scene kB
+nearest_view  -       -         -       18.00    -      0.500  -      -      -          -         -           -     -       -
+mean_image    -       -         -       -        -      -      -      -      -          -         -           -     -       -
+clift         64      32        int8    20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  49152   99.0      tb
+DepthSplat    -       -         -       19.00    -      -      0.250  -      -          -         -           -     -       -
 
 frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
 t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes

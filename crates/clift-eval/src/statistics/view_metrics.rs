@@ -73,6 +73,8 @@ pub struct ViewMetrics {
     pub ssim: Option<f64>,
     /// LPIPS with VGG-16; `None` without its weights and below 16 x 16 pixels.
     pub lpips_vgg: Option<f64>,
+    /// Mean gradient magnitude over that of the target; `None` for a target without contrast.
+    pub sharpness: Option<f64>,
     /// Rendering time of this view, from tokens to pixels, in seconds.
     pub render_s: Option<f64>,
     /// Time of the token selection, in seconds.
@@ -92,7 +94,7 @@ impl ViewMetrics {
 
     /// Returns metrics with PSNR and SSIM only.
     pub const fn quality(psnr: f64, ssim: Option<f64>) -> Self {
-        Self { psnr, ssim, lpips_vgg: None, render_s: None, select_s: None }
+        Self { psnr, ssim, lpips_vgg: None, sharpness: None, render_s: None, select_s: None }
     }
 }
 
@@ -103,6 +105,7 @@ pub(crate) type Metric = fn(&ViewMetrics) -> Option<f64>;
 pub(crate) const PSNR: Metric = |view| Some(view.psnr.min(PSNR_CAP_DB));
 pub(crate) const SSIM: Metric = |view| view.ssim;
 pub(crate) const LPIPS: Metric = |view| view.lpips_vgg;
+pub(crate) const SHARPNESS: Metric = |view| view.sharpness;
 
 /// Returns the mean over the views of a scene that have the metric, by target frame; `None` without one.
 pub(crate) fn view_mean(views: &BTreeMap<usize, ViewMetrics>, metric: Metric) -> Option<f64> {

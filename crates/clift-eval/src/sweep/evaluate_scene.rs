@@ -14,6 +14,7 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{Cost, EvalKey};
 use crate::sweep::compressed_tokens::CompressedTokens;
+use crate::sweep::context_check::check_contexts;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
@@ -51,6 +52,10 @@ pub fn evaluate_scene(
     }
     let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
     metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
+    metrics.context_frames.insert(clip.key.clone(), clip.context.frame_index.clone());
+    if sweep.checks_contexts {
+        metrics.add_context_check(check_contexts(models, &context, clip)?);
+    }
     for (view, &frame) in clip.target.frame_index.iter().enumerate() {
         if let Some((_, share)) = scorer.weights(view) {
             metrics.masked.entry(clip.key.clone()).or_default().insert(frame, 1.0 - share);

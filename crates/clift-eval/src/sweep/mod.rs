@@ -5,12 +5,14 @@
 //! - `lazy_clusters`: K-means or tiles, computed once
 //! - `compressed_tokens`: stored tokens of a method
 //! - `token_choice`: tokens selected for each view
+//! - `context_check`: the context views, rendered themselves
 //! - `view_scorer`: score renderings of a scene
 //! - `rendered_views`: scored views of one `EvalKey`, results of one scene
 //! - `predictions`: images of another method, scored
 //! - `evaluate_scene`: encode once, render every key
 
 pub(crate) mod compressed_tokens;
+pub(crate) mod context_check;
 pub(crate) mod eval_models;
 pub(crate) mod evaluate_scene;
 pub(crate) mod lazy_clusters;

@@ -5,8 +5,7 @@ use std::collections::BTreeMap;
 
 use clift_core::ClipViews;
 use clift_data::Clip;
-use clift_model::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures, SSIM_MIN_SIZE_PX, psnr, ssim};
-
+use clift_model::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures, SSIM_MIN_SIZE_PX, psnr, sharpness, ssim};
 use clift_scene::view_image;
 
 use crate::error::EvalError;
@@ -48,14 +47,14 @@ impl<'a> ViewScorer<'a> {
     /// Pixels that do not count are replaced by the target's, and errors are divided by the share of the others: the mean
     /// squared error is that of the pixels that count; SSIM and LPIPS, which see neighbourhoods, are approximations.
     pub fn measure(&self, pixels: &[f32], view: usize) -> Result<ViewMetrics, EvalError> {
-        let Some((weights, share)) = self.weights(view) else { return self.measure_whole(pixels, view) };
+        let Some((weights, share)) = self.weights(view) else { return self.measure_whole(pixels, view, None) };
         let target = view_image(self.target, view);
         let mut pixels = pixels.to_vec();
         for ((pixel, target), weight) in pixels.chunks_exact_mut(3).zip(target.chunks_exact(3)).zip(weights) {
             let weight = f32::from(*weight) / 255.0;
             pixel.iter_mut().zip(target).for_each(|(pixel, target)| *pixel = target + (*pixel - target) * weight);
         }
-        let whole = self.measure_whole(&pixels, view)?;
+        let whole = self.measure_whole(&pixels, view, Some(weights))?;
         Ok(ViewMetrics {
             psnr: whole.psnr + 10.0 * share.log10(),
             ssim: whole.ssim.map(|ssim| 1.0 - (1.0 - ssim) / share),
@@ -64,13 +63,15 @@ impl<'a> ViewScorer<'a> {
         })
     }
 
-    fn measure_whole(&self, pixels: &[f32], view: usize) -> Result<ViewMetrics, EvalError> {
+    /// Measures all pixels; sharpness by their `weights`.
+    fn measure_whole(&self, pixels: &[f32], view: usize, weights: Option<&[u8]>) -> Result<ViewMetrics, EvalError> {
         let target = view_image(self.target, view);
         let (height, width) = (self.target.height, self.target.width);
         let has_ssim = height.min(width) >= SSIM_MIN_SIZE_PX;
         let ssim = has_ssim.then(|| ssim(pixels, &target, height, width)).transpose()?;
         let lpips_vgg = self.lpips.map(|lpips| self.lpips_distance(lpips, pixels, &target, view)).transpose()?;
-        Ok(ViewMetrics { lpips_vgg, ..ViewMetrics::quality(psnr(pixels, &target)?, ssim) })
+        let sharpness = sharpness(pixels, &target, [height, width], weights)?;
+        Ok(ViewMetrics { lpips_vgg, sharpness, ..ViewMetrics::quality(psnr(pixels, &target)?, ssim) })
     }
 
     fn lpips_distance(&self, lpips: &Lpips, pixels: &[f32], target: &[f32], view: usize) -> Result<f64, EvalError> {
@@ -108,6 +109,7 @@ mod tests {
         let measured = scorer.measure(&left, 0).unwrap();
         assert!((measured.psnr - 20.0).abs() < 1e-5, "{measured:?}");
         assert!(measured.ssim.unwrap() < 0.5, "{measured:?}");
+        assert_eq!(measured.sharpness, None, "the target has no contrast");
         assert_eq!(scorer.weights(0).map(|(_, share)| share), Some(0.5));
         // Nothing counts in the second view: it is measured whole.
         assert_eq!(scorer.weights(1), None);

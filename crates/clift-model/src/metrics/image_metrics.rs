@@ -1,4 +1,4 @@
-//! PSNR and SSIM of one image, in f64.
+//! PSNR, SSIM and sharpness of one image, in f64.
 //!
 //! Images are row-major `[height, width, 3]` slices with values in [0, 1].
 
@@ -11,6 +11,10 @@ const SSIM_RADIUS: usize = 5;
 const SSIM_SIGMA_PX: f64 = 1.5;
 const SSIM_C1: f64 = 0.01 * 0.01;
 const SSIM_C2: f64 = 0.03 * 0.03;
+/// Luminance of RGB, that of scikit-image's `rgb2gray`.
+const LUMINANCE: [f64; 3] = [0.2125, 0.7154, 0.0721];
+/// Mean gradient of a target below which its sharpness means nothing: a quarter of an 8-bit level per pixel.
+const MIN_GRADIENT: f64 = 1e-3;
 /// scikit-image's `use_sample_covariance`: n / (n - 1) with n = 11 x 11.
 const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 
@@ -99,6 +103,43 @@ fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64>
     blurred
 }
 
+/// Measures the sharpness of a `[height, width, 3]` image: its mean gradient magnitude over that of the target. Below 1 it
+/// is blurred, 1 for identical images; noise is sharp too. `None` for a target without contrast, of a mean below 1e-3.
+///
+/// The gradient is that of the luminance (0.2125 R + 0.7154 G + 0.0721 B) after clamping to [0, 1], by forward differences to
+/// the right and downward. The mean leaves out the last row and column, and is weighted by `weights`, one per pixel.
+///
+/// # Errors
+/// [`ModelError::BadImage`].
+pub fn sharpness(
+    pred: &[f32],
+    target: &[f32],
+    [height, width]: [usize; 2],
+    weights: Option<&[u8]>,
+) -> Result<Option<f64>, ModelError> {
+    check_images(pred, target, height * width * 3)?;
+    if height.min(width) < 2 {
+        return Ok(None);
+    }
+    let of_target = mean_gradient(target, width, weights);
+    Ok((of_target >= MIN_GRADIENT).then(|| mean_gradient(pred, width, weights) / of_target))
+}
+
+/// Returns the weighted mean; NaN where every weight is 0.
+fn mean_gradient(image: &[f32], width: usize, weights: Option<&[u8]>) -> f64 {
+    let luminance = |pixel: &[f32]| {
+        pixel.iter().zip(LUMINANCE).map(|(&value, weight)| weight * f64::from(value.clamp(0.0, 1.0))).sum::<f64>()
+    };
+    let plane: Vec<f64> = image.chunks_exact(3).map(luminance).collect();
+    let (mut sum, mut sum_weights) = (0.0, 0.0);
+    for pixel in (0..plane.len() - width).filter(|pixel| (pixel + 1) % width > 0) {
+        let weight = weights.map_or(1.0, |weights| f64::from(weights[pixel]));
+        sum += weight * (plane[pixel + 1] - plane[pixel]).hypot(plane[pixel + width] - plane[pixel]);
+        sum_weights += weight;
+    }
+    sum / sum_weights
+}
+
 /// Refuses images of another size than `expected` values, NaN and infinity.
 ///
 /// # Errors
@@ -131,11 +172,12 @@ mod tests {
     use crate::testing::Fixture;
 
     #[test]
-    fn psnr_and_ssim_equal_torch_and_scikit_image() {
+    fn metrics_equal_torch_and_scikit_image() {
         let fixture = Fixture::open("metrics");
         let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
         let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
-        let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));
+        let [expected_psnr, expected_ssim, expected_sharpness] =
+            ["output.psnr", "output.ssim", "output.sharpness"].map(|name| fixture.f64s(name));
         let size = height * width * 3;
         for i in 0..count {
             let (pred, target) = (&pred[i * size..][..size], &target[i * size..][..size]);
@@ -145,6 +187,11 @@ mod tests {
             // The variances are differences of numbers near 1, divided by at least C2 = 9e-4: 1e-16 / 9e-4 = 1e-13 per
             // pixel. 1e-10 has room and still detects f32 filters (1e-6).
             assert!((ssim - expected_ssim[i]).abs() < 1e-10, "pair {i}: {ssim} is not {}", expected_ssim[i]);
+            // NaN: the target has no contrast.
+            let (sharpness, expected) =
+                (sharpness(pred, target, [height, width], None).unwrap(), expected_sharpness[i]);
+            assert_eq!(sharpness.is_none(), expected.is_nan(), "pair {i}");
+            assert!(sharpness.is_none_or(|value| (value - expected).abs() < 1e-10), "pair {i}: {sharpness:?}");
         }
     }
 
@@ -157,12 +204,27 @@ mod tests {
     }
 
     #[test]
+    fn sharpness_counts_pixels_by_weight() {
+        // Stripes of 12 x 2 pixels, of which a rendering keeps the left half and halves the contrast of the right.
+        let stripes = |contrast: [f32; 2]| -> Vec<f32> {
+            (0..24).flat_map(|i| [contrast[usize::from(i % 12 >= 6)] * (i % 2) as f32; 3]).collect()
+        };
+        let (target, pred) = (stripes([1.0, 1.0]), stripes([1.0, 0.5]));
+        let right = [[0; 6], [255; 6]].concat().repeat(2);
+        let sharpness = |weights| sharpness(&pred, &target, [2, 12], weights).unwrap();
+        assert!((sharpness(Some(&right[..])).unwrap() - 0.5).abs() < 1e-12);
+        assert!((0.5..1.0).contains(&sharpness(None).unwrap()));
+        assert_eq!(sharpness(Some(&[0; 24])), None);
+    }
+
+    #[test]
     fn bad_images_are_errors() {
         for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let mut pred = vec![0.5; 11 * 11 * 3];
             pred[7] = value;
             let target = vec![0.5; 11 * 11 * 3];
-            for result in [psnr(&pred, &target), ssim(&pred, &target, 11, 11)] {
+            let sharpness = sharpness(&pred, &target, [11, 11], None).map(Option::unwrap_or_default);
+            for result in [psnr(&pred, &target), ssim(&pred, &target, 11, 11), sharpness] {
                 let expected = format!("the prediction is not finite: value {value} at index 7");
                 assert_eq!(result.unwrap_err().to_string(), expected);
             }

@@ -1,6 +1,6 @@
-//! Metrics of images, and the networks that measure them: PSNR, SSIM, LPIPS, and the perceptual loss.
+//! Metrics of images, and the networks that measure them: PSNR, SSIM, sharpness, LPIPS, and the perceptual loss.
 //!
-//! - `image_metrics`: PSNR and SSIM
+//! - `image_metrics`: PSNR, SSIM and sharpness
 //! - `vgg`: VGG-16 and VGG-19 features
 //! - `network_file`: converted VGG weights, read strictly
 //! - `lpips`: LPIPS

@@ -104,6 +104,7 @@ impl Config {
             lpips: None,
             external_methods: Vec::new(),
             is_cpu: device.is_cpu(),
+            checks_contexts: false,
             min_timed_views: 0,
             seed: derive_seed(*seed, "eval"),
         }

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, open_dataset};
-use clift_eval::{EvalFrames, EvalModels, Method, Summary};
+use clift_data::{ClipReader, Split, open_dataset};
+use clift_eval::{EvalFrames, EvalModels, EvalSplit, Method, Summary};
 use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
 use clift_scene::TokenCodec;
 
@@ -19,6 +19,8 @@ use crate::run::validation::{EvalRequest, Validation};
 ///
 /// A model with a condenser is measured on condensed tokens only, unless `stage1` is given: the model it was trained from,
 /// which renders the other methods.
+///
+/// In data without splits `data.hold_out` chooses the frames that a run with this key would hold out and measure; 0 for all.
 ///
 /// # Errors
 /// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for methods that
@@ -59,13 +61,15 @@ pub fn evaluate_model(
         models.set_stage2(config.clusters.grouping, last);
     }
     let split = request.split;
-    // No frame of this data set is held out of the training of a foreign model.
-    config.data.hold_out = 0;
     let opened = open_dataset(&config.data, split, &mut |done, total| sink.event(&Event::Scan { done, total }))?;
     sink.event(&Event::Message(format!("{split}: {}", opened.report)));
-    let frames = EvalFrames::new(&opened, split, 0, false);
+    let mut frames = EvalFrames::new(&opened, split, 0, false);
+    if frames.split == EvalSplit::OtherData && split == Split::Test {
+        frames.hold_out = config.data.hold_out;
+    }
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
-    let validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
+    let mut validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
+    validation.check_contexts();
     validation.evaluate(&models, request, &Ranks::single(), stop, sink)
 }
 

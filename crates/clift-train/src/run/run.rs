@@ -234,6 +234,9 @@ impl Run {
                 sink.event(&Event::Warning(warning));
             }
         }
+        if !self.is_training_data {
+            validation.check_contexts();
+        }
         validation.evaluate(&models, request, &self.ranks, stop, sink)
     }
 

@@ -80,6 +80,11 @@ impl<'a> Validation<'a> {
         training_scenes_note(&self.evaluator.training_scenes)
     }
 
+    /// Renders the context views of the evaluation too: on data that the model was not trained on they may be too far apart.
+    pub fn check_contexts(&mut self) {
+        self.evaluator.sweep.checks_contexts = true;
+    }
+
     /// Measures a model without autodiff during training, the scenes shared by the ranks: with all tokens in stage 1, with
     /// one count of condensed tokens in stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB;
     /// `None` if no view could be measured or `stop` is set.

@@ -63,6 +63,10 @@ fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     check_network(&config.model, &ModelPath { dir: folder.into(), weights: folder.into() })?;
     // The directory may have been moved since it was written.
     config.run_dir = folder.to_path_buf();
+    if args.checkpoint.is_some() && !args.overrides.sets("data", "hold_out") {
+        // No frame of this data set is held out of the training of a foreign model.
+        config.data.hold_out = 0;
+    }
     if let Some(data) = &args.data {
         config.data.root = Some(data.clone());
         if config.data.source == SourceKind::Synthetic {

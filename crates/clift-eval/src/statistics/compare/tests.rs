@@ -51,6 +51,24 @@ fn differences_are_paired_by_view() {
 }
 
 #[test]
+fn sharpness_is_compared_where_both_have_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let sharp = |name: &str, values: [f64; 2]| {
+        let path = folder.path().join(name);
+        let rows = format!("x,1,clift,8,8,20,,,,,f32,{}\ny,1,clift,8,8,20,,,,,f32,{}\n", values[0], values[1]);
+        std::fs::write(&path, format!("{HEAD},sharpness\n{rows}")).unwrap();
+        Evaluation::read(&path).unwrap()
+    };
+    let (a, b) = (sharp("a", [0.25, 0.5]), sharp("b", [0.5, 0.75]));
+    let comparison = Comparison::new(&a, &b, None).unwrap();
+    assert_eq!(comparison.pairs[0].sharpness.unwrap().mean, 0.25);
+    assert!(comparison.to_string().contains("+0.250 [+0.250, +0.250] *"), "{comparison}");
+    // A file without the column.
+    let older = evaluation(folder.path(), "older", &["x,1,clift,8,8,20,,,,,f32"]);
+    assert_eq!(Comparison::new(&a, &older, None).unwrap().pairs[0].sharpness, None);
+}
+
+#[test]
 fn keys_of_one_side_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let a = evaluation(folder.path(), "a", &["x,1,clift,8,8,20,,,,,f32", "x,1,tile,8,8,19,,,,,f32"]);

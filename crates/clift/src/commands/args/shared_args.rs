@@ -46,6 +46,12 @@ impl ConfigArgs {
         config.device = self.device.unwrap_or(config.device);
         Ok(config)
     }
+
+    /// Whether `--set` gives a key, even with the value of the config.
+    pub fn sets(&self, section: &str, key: &str) -> bool {
+        let mut tables = self.set.iter().filter_map(|text| text.parse::<toml::Table>().ok());
+        tables.any(|table| table.get(section).is_some_and(|section| section.get(key).is_some()))
+    }
 }
 
 /// Reads a config, applies the overrides of `--set`, checks the values and prints what changed. Where a path of [`CONFIGS`] does
