@@ -114,7 +114,9 @@ fn control_characters_of_keys_do_not_reach_the_terminal() {
 #[test]
 fn conversion_and_check_without_scenes_fail() {
     let place = Place::new();
-    write_changed(&place, "torn", |scene| scene.cameras[0].c2w.translation[0] = f64::NAN);
+    write_changed(&place, "torn", |scene| {
+        scene.cameras.iter_mut().for_each(|camera| camera.c2w.translation[0] = f64::NAN);
+    });
     let ran = place.clift("data convert DIR/data DIR/out --to chunks").prints("0 scenes of 1");
     ran.fails_with(1, &["skipped torn: ", "no scene of test could be converted"]);
     assert!(!place.at("out/test/index.json").exists());

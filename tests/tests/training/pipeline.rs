@@ -165,7 +165,7 @@ fn early_stages_name_what_to_run_first() {
     let ran = place.eval("run").ok().notes("stage 2 has not run");
     assert!(!ran.stdout.contains("\nclift "), "{}", ran.stdout);
 
-    place.eval("nowhere").fails_naming(2, &[], "nowhere/config.toml");
+    place.eval("nowhere").fails_with(2, &["no such folder; write the `run_dir` of a `clift train`"]);
 }
 
 #[test]

@@ -4,8 +4,7 @@
 use clift_core::{Camera, DMat3, Pose, PoseNormalization};
 use glam::DQuat;
 
-use crate::scene::read::split_groups;
-use crate::scene::scene::ContextGroup;
+use crate::scene::scene::{ContextGroup, split_groups};
 
 /// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
 const WORLD_BYTES: usize = 4 * 4 + 4 * 8;

@@ -10,7 +10,7 @@ use crate::codec::token_codec::TokenCodec;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
-use crate::scene::scene::{CODED_VERSION, ContextGroup, FORMAT, Scene, VERSION, dtype_name};
+use crate::scene::scene::{CODED_VERSION, ContextGroup, FORMAT, Scene, VERSION, dtype_name, split_groups};
 use crate::scene::token_coding::TokenCoding;
 use crate::scene::token_format::TokenFormat;
 use crate::tensors::Tensors;
@@ -153,23 +153,6 @@ fn from_bytes(
 fn normalization(mean_c2w: &[f64; 16], scale: f64) -> Result<PoseNormalization, String> {
     let mean_c2w = Pose::from_matrix(mean_c2w).map_err(|error| format!("mean pose: {error}"))?;
     Ok(PoseNormalization { mean_c2w, scale })
-}
-
-/// Splits the members of all groups by the sizes of the groups.
-pub(crate) fn split_groups(sizes: &[u32], members: &[u32]) -> Result<Vec<Vec<u32>>, String> {
-    let mut rest = members;
-    let mut groups = Vec::with_capacity(sizes.len());
-    for (group, &size) in sizes.iter().enumerate() {
-        let Some((views, others)) = rest.split_at_checked(size as usize) else {
-            return Err(format!("group {group} has {size} views, {} are left of {}", rest.len(), members.len()));
-        };
-        groups.push(views.to_vec());
-        rest = others;
-    }
-    if !rest.is_empty() {
-        return Err(format!("{} views after the last group", rest.len()));
-    }
-    Ok(groups)
 }
 
 /// Checks the length of the header before the header is parsed.

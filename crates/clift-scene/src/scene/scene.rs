@@ -156,6 +156,23 @@ impl Scene {
     }
 }
 
+/// Splits the members of all groups by the sizes of the groups.
+pub(crate) fn split_groups(sizes: &[u32], members: &[u32]) -> Result<Vec<Vec<u32>>, String> {
+    let mut rest = members;
+    let mut groups = Vec::with_capacity(sizes.len());
+    for (group, &size) in sizes.iter().enumerate() {
+        let Some((views, others)) = rest.split_at_checked(size as usize) else {
+            return Err(format!("group {group} has {size} views, {} are left of {}", rest.len(), members.len()));
+        };
+        groups.push(views.to_vec());
+        rest = others;
+    }
+    if !rest.is_empty() {
+        return Err(format!("{} views after the last group", rest.len()));
+    }
+    Ok(groups)
+}
+
 /// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + 140 G + 4 M + S (28 + D b)` for V context views, G
 /// groups of M members and S tokens of width D with b bytes per value, and four more bytes per token for `int8`. Learned
 /// tokens have neither ray nor patch, 28 bytes less.

@@ -9,7 +9,6 @@ use clift_core::{TEMPORARY, make_folder, publish_folder, remove_leftovers, repla
 use clift_data::{image_size, plural};
 use serde::{Deserialize, Serialize};
 
-use crate::commands::args::parse::parse_output;
 use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{SourceArgs, Splits};
 use crate::commands::data::check::{self, CheckArgs};
@@ -263,7 +262,7 @@ pub struct PosesArgs {
     #[arg(value_name = "PHOTOS_OR_FILM")]
     pub photos: PathBuf,
     /// Capture to write; continues an interrupted one
-    #[arg(short, long, value_name = "CAPTURE", value_parser = parse_output)]
+    #[arg(short, long, value_name = "CAPTURE")]
     pub out: PathBuf,
     /// Number of frames to extract from a film
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(3..=2000))]
