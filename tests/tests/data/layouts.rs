@@ -56,7 +56,7 @@ fn the_program_alone_encodes_photos_renders_and_trains() {
         finish(start(&mut command)).ok()
     };
     let ran = alone("encode scene --hold-out 8 -o scene.clift");
-    let ran = ran.prints("14 of 16 views in 8 groups of 64 x 64").prints("(clift, coded").notes("model: models/rooms");
+    let ran = ran.prints("14 of 16 views in 9 groups of 64 x 64").prints("(clift, coded").notes("model: models/rooms");
     // Renderings of the frames beside the contexts are better than copies of the nearest.
     ran.prints("check: 2 frames held out: ").prints("; 2 rendered better");
     alone("render scene.clift --path orbit --frames 2 -o orbit")

@@ -48,7 +48,10 @@ fn published_checkpoints_import_evaluate_encode_and_render() {
             assert!(config.contains(&line), "{line}\nis not in\n{config}");
         }
         // As for a network that was trained on small images.
-        let small = config.replace("width = 256", "width = 24").replace("height = 256", "height = 16");
+        let small = config
+            .replace("width = 256", "width = 24")
+            .replace("width = 448", "width = 24")
+            .replace("height = 256", "height = 16");
         place.write(&format!("{name}/config.toml"), small);
         let summary = evaluate(&place, &model, &format!("{name}-eval"), "");
         assert_eq!((&summary["num_scenes"], &summary["num_views"]), (&1.into(), &4.into()));

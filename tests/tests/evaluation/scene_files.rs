@@ -365,7 +365,7 @@ fn encode_chooses_scenes_by_key_context_and_count() {
 
     // Chunks of the same kind as the run's or not: any folder of them, either half, whole or by its index.
     let mini = "REPO/data-fixtures/re10k-mini";
-    encode(mini).ok().prints("scene 00000000000000b1, 2 views of 16 x 16");
+    encode(mini).ok().prints("scene 00000000000000b1, 8 views in 5 groups of 16 x 16");
     encode(&format!("{mini}/test")).ok().prints("scene 00000000000000b1");
     let second = encode(&format!("{mini} --split train --scene 00000000000000a2")).ok();
     second.prints("scene 00000000000000a2");
@@ -373,7 +373,7 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     let sized =
         |width: usize, height: usize| encode(&format!("{mini} --set data.width={width} --set data.height={height}"));
     let warning = "warning: the network was trained on images of 16 x 16; images of 24 x 16 may lose quality";
-    sized(24, 16).ok().prints("2 views of 24 x 16").notes(warning);
+    sized(24, 16).ok().prints("8 views in 5 groups of 24 x 16").notes(warning);
     for (size, times) in [(32, "2.00"), (8, "0.50")] {
         let images =
             format!("at {size} x {size} pixels, images of 64 x 36 have {times} times as many pixels per angle");

@@ -1,9 +1,12 @@
 //! The context views of a scene: requested frames, frames along the camera path, or groups of neighbours.
 
+use std::collections::BTreeSet;
+
 use clift_core::{Pose, PoseNormalization, ViewDistance};
 use clift_data::{ClipReader, DataError, contexts_along_path};
-use clift_model::{ModelConfig, ModelError};
+use clift_model::{ModelConfig, ModelError, TokenCount};
 
+use crate::encode::encode::EncodeOptions;
 use crate::encode::groups::{nearest_views, neighbour_groups};
 use crate::error::SceneError;
 use crate::scene::scene::ContextGroup;
@@ -12,6 +15,8 @@ use crate::scene::scene::ContextGroup;
 const MAX_VIEWS: usize = 128;
 /// Groups of neighbours over the context views, by default.
 const GROUPS_PER_VIEW: f64 = 0.75;
+/// Fewest stored tokens of a group, by default.
+const MIN_TOKENS: usize = 32;
 
 /// The context views of a scene, and which of them are encoded together.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -31,7 +36,8 @@ pub enum ContextChoice {
     Neighbours {
         /// Views of a group.
         num_views: usize,
-        /// Number of groups; `None` for three for every four views. There are more where these leave a view out.
+        /// Number of groups, of which few leave views out; `None` for three for every four views, and more where these leave a
+        /// view out, but for no more than one for every 32 of a number of stored tokens.
         num_groups: Option<usize>,
     },
 }
@@ -59,34 +65,43 @@ pub struct Contexts {
 }
 
 impl Contexts {
-    /// Returns the context views that [`encode`](crate::encode) chooses: none of every `hold_out` frames, 0 for all frames.
+    /// Returns the context views that [`encode`](crate::encode) chooses.
     ///
     /// # Errors
     /// [`ModelError::BadConfig`] for frames that the scene does not have, those of the cameras, and
     /// [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
-    pub fn choose(
-        reader: &ClipReader,
-        scene: usize,
-        choice: &ContextChoice,
-        hold_out: usize,
-    ) -> Result<Self, SceneError> {
+    pub fn choose(reader: &ClipReader, scene: usize, options: &EncodeOptions) -> Result<Self, SceneError> {
         let (key, data) = (reader.source.key(scene), &reader.options);
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
-        let held_out = if hold_out == 0 { Vec::new() } else { reader.source.held_out(scene, hold_out)? };
-        let frames = choose_frames(&poses, choice, &held_out)?;
-        let context: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
-        let find = |views: &[Pose]| PoseNormalization::find(key, views, &[], data.pose_rotation, data.pose_scale);
-        let normalization = find(&context).map_err(DataError::from)?;
-        let ContextChoice::Neighbours { num_views, num_groups } = *choice else {
+        let held_out = match options.hold_out {
+            0 => Vec::new(),
+            every => reader.source.held_out(scene, every)?,
+        };
+        let frames = choose_frames(&poses, &options.context, &held_out)?;
+        let find = |views: &[Pose]| {
+            PoseNormalization::find(key, views, &[], data.pose_rotation, data.pose_scale).map_err(DataError::from)
+        };
+        let of_frames = |frames: &[usize]| frames.iter().map(|&frame| poses[frame]).collect::<Vec<_>>();
+        let ContextChoice::Neighbours { num_views, num_groups } = options.context else {
+            let normalization = find(&of_frames(&frames))?;
             return Ok(Self { groups: vec![ContextGroup::of_all(frames.len())], frames, normalization });
         };
-        let context: Vec<Pose> = context.into_iter().map(|pose| normalization.normalize(pose)).collect();
-        let default = (GROUPS_PER_VIEW * frames.len() as f64).ceil() as usize;
-        let groups = neighbour_groups(&context, num_views, num_groups.unwrap_or(default)).into_iter().map(|views| {
-            let poses: Vec<Pose> = views.iter().map(|&view| context[view]).collect();
+        let groups = match (num_groups, most_groups(options.stored_tokens, frames.len())) {
+            (Some(count), _) | (None, Some(count)) => neighbour_groups(&of_frames(&frames), num_views, count, false),
+            (None, None) => neighbour_groups(&of_frames(&frames), num_views, default_groups(frames.len()), true),
+        };
+        // The members of the groups alone are context views.
+        let members: BTreeSet<usize> = groups.iter().flatten().copied().collect();
+        let position = |view: &usize| members.range(..view).count() as u32;
+        let frames: Vec<usize> = members.iter().map(|&view| frames[view]).collect();
+        let normalization = find(&of_frames(&frames))?;
+        let context: Vec<Pose> = of_frames(&frames).into_iter().map(|pose| normalization.normalize(pose)).collect();
+        let groups = groups.iter().map(|views| {
+            let views: Vec<u32> = views.iter().map(position).collect();
+            let poses: Vec<Pose> = views.iter().map(|&view| context[view as usize]).collect();
             // Views that turn in place have no scale of their own.
             let frame = find(&poses).unwrap_or(PoseNormalization { mean_c2w: poses[0], scale: 1.0 });
-            ContextGroup { views: views.iter().map(|&view| view as u32).collect(), frame }
+            ContextGroup { views, frame }
         });
         Ok(Self { groups: groups.collect(), frames, normalization })
     }
@@ -95,6 +110,17 @@ impl Contexts {
     pub fn num_members(&self) -> usize {
         self.groups.iter().map(|group| group.views.len()).sum()
     }
+}
+
+fn default_groups(num_frames: usize) -> usize {
+    (GROUPS_PER_VIEW * num_frames as f64).ceil() as usize
+}
+
+/// Returns the most groups for which a number of stored tokens is enough; `None` if that is no limit.
+fn most_groups(stored_tokens: Option<TokenCount>, num_frames: usize) -> Option<usize> {
+    let Some(TokenCount::Count(count)) = stored_tokens else { return None };
+    let most = (count / MIN_TOKENS).max(1);
+    (most < default_groups(num_frames)).then_some(most)
 }
 
 /// Chooses frames of a scene that are not held out, or checks those of the choice.
@@ -147,6 +173,15 @@ fn bad(key: &'static str, value: String, fix: String) -> SceneError {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn few_tokens_have_few_groups() {
+        let most = |stored, num_frames| most_groups(stored, num_frames);
+        assert_eq!(most(Some(TokenCount::Count(20)), 40), Some(1));
+        assert_eq!(most(Some(TokenCount::Count(100)), 40), Some(3));
+        assert_eq!(most(Some(TokenCount::Count(960)), 40), None, "32 for each of 30 groups");
+        assert_eq!([most(Some(TokenCount::Share(0.001)), 40), most(None, 40)], [None; 2]);
+    }
 
     #[test]
     fn context_frames_are_checked_spread_or_neighbours() {

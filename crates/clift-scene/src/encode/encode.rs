@@ -90,8 +90,7 @@ pub fn encode(
     options: &EncodeOptions,
 ) -> Result<EncodedScene, SceneError> {
     let (key, data) = (reader.source.key(scene), &reader.options);
-    let Contexts { frames, groups, normalization } =
-        Contexts::choose(reader, scene, &options.context, options.hold_out)?;
+    let Contexts { frames, groups, normalization } = Contexts::choose(reader, scene, options)?;
     let views = ViewIndices { context: frames, target: Vec::new() };
     let mut clip = reader.read(scene, &views)?;
     let cameras = reader.source.cameras(scene)?;

@@ -68,7 +68,7 @@ pub fn encode_scene(
 ) -> Result<WrittenScene, SceneError> {
     let frame_names = reader.source.frame_names(index)?;
     let coder = Coder::new(options.coding, &options.weights, model)?;
-    let contexts = Contexts::choose(reader, index, &options.encode.context, options.encode.hold_out)?;
+    let contexts = Contexts::choose(reader, index, &options.encode)?;
     let size = [reader.options.height, reader.options.width];
     let best = coder.best_count(&contexts, size, &options.encode.model_path);
     let stored_tokens = options.encode.stored_tokens.or(best);

@@ -2,19 +2,19 @@
 
 use clift_core::{Pose, ViewDistance};
 
-/// Chooses `num_groups` groups of `num_views` neighbours that together contain every view, in ascending order each. Groups
-/// overlap. There are more than `num_groups` if these leave a view out.
+/// Chooses `num_groups` groups of `num_views` neighbours, in ascending order each. Groups overlap. If `all` views must be
+/// members, there are more than `num_groups` where these leave a view out.
 ///
 /// A group is a seed with the views nearest to it. The next seed is the view farthest from all seeds, among the views in no
 /// group as long as there are any.
-pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usize) -> Vec<Vec<usize>> {
+pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usize, all: bool) -> Vec<Vec<usize>> {
     let distance = ViewDistance::new(views);
     let mut to_seeds = vec![f64::INFINITY; views.len()];
     let mut is_left_out = vec![true; views.len()];
     let mut groups = Vec::new();
     for _ in 0..views.len() {
         let any_left = is_left_out.contains(&true);
-        if groups.len() >= num_groups && !any_left {
+        if groups.len() >= num_groups && !(all && any_left) {
             break;
         }
         // The first of equally far views.
@@ -58,12 +58,13 @@ mod tests {
     #[test]
     fn groups_are_neighbours_and_contain_every_view() {
         let steady: Vec<f64> = (0..10).map(f64::from).collect();
-        let groups = |places: &[f64], count| neighbour_groups(&on_a_line(places), 4, count);
+        let groups = |places: &[f64], count| neighbour_groups(&on_a_line(places), 4, count, true);
         assert_eq!(groups(&steady, 1), [vec![0, 1, 2, 3], vec![2, 3, 4, 5], vec![6, 7, 8, 9]], "as few as needed");
         let more = groups(&steady, 6);
         assert!(more.iter().all(|group| group.len() == 4 && group[3] - group[0] <= 4), "{more:?}");
         assert!((0..10).all(|view| more.iter().any(|group| group.contains(&view))), "{more:?}");
         assert_eq!(groups(&steady[..3], 5), [vec![0, 1, 2]], "equal groups count once");
+        assert_eq!(neighbour_groups(&on_a_line(&steady), 4, 1, false), [[0, 1, 2, 3]], "others are left out");
         // Two clusters far apart are not mixed.
         let apart = groups(&[0.0, 0.1, 0.2, 0.3, 9.0, 9.1, 9.2, 9.3], 2);
         assert_eq!(apart, [vec![0, 1, 2, 3], vec![4, 5, 6, 7]]);

@@ -113,7 +113,8 @@ impl RunScenes {
         check_position("scene", request.scene, self.items.len())?;
         let (index, context) = &self.items[request.scene];
         let clift_data::ClipOptions { width, height, .. } = self.reader.options;
-        let num_members = Contexts::choose(&self.reader, *index, context, 0)?.num_members();
+        let options = EncodeOptions { context: context.clone(), stored_tokens: None, ..self.options.clone() };
+        let num_members = Contexts::choose(&self.reader, *index, &options)?.num_members();
         let num_tokens = self.model.config.num_tokens(num_members, height, width)?;
         let counts = self.storage_counts(num_tokens);
         // Without a request, the count nearest to that of `clift encode`, a quarter.

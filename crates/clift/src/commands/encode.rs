@@ -57,7 +57,9 @@ pub struct EncodeArgs {
     /// Encode this frame and those nearest to it, as one group
     #[arg(long, value_name = "FRAME", conflicts_with = "groups")]
     pub near: Option<String>,
-    /// Number of groups of neighbours [default: 3 for every 4 photos]
+    /// Number of groups of neighbours [default: 3 for every 4 photos, with 32 tokens each]
+    ///
+    /// Few groups leave photos out.
     #[arg(long, value_name = "COUNT")]
     pub groups: Option<usize>,
     /// Leave one of N photos out, and compare it with its rendering

@@ -159,7 +159,7 @@ fn folder_items(
     let (mut items, mut skip_report) = (Vec::with_capacity(count), SkipReport::new(count));
     for scene in 0..count {
         let context = model_args.context();
-        match Contexts::choose(reader, scene, &context, 0) {
+        match Contexts::choose(reader, scene, &EncodeOptions { context: context.clone(), ..EncodeOptions::default() }) {
             Ok(_) => items.push((scene, context)),
             Err(error) => skip_report.skip(source.key(scene), error.to_string()),
         }
