@@ -97,6 +97,9 @@ fn every_documented_command_runs() {
                 command.env("PATH", place.at("bin"));
             }
             let ran = finish(start(command.args(&args).current_dir(&folder)));
+            if args[0] == "import" {
+                take_small_images(&folder, &args);
+            }
             // A check with a flagged scene is a result.
             let is_flagged =
                 args.starts_with(&["data".into(), "check".into()]) && ran.code == Some(1) && !ran.stdout.is_empty();
@@ -177,6 +180,15 @@ fn make_room(folder: &Path, args: &[String]) {
     drop(std::fs::remove_dir_all(folder.join("trained")));
 }
 
+/// Makes an imported model one of small images, as the fixtures have.
+fn take_small_images(folder: &Path, args: &[String]) {
+    let Some(pair) = args.windows(2).find(|pair| pair[0] == "-o") else { return };
+    let path = folder.join(&pair[1]).join("config.toml");
+    let Ok(config) = std::fs::read_to_string(&path) else { return };
+    let config = config.replace("width = 448", "width = 24").replace("width = 256", "width = 24");
+    std::fs::write(path, config.replace("height = 256", "height = 16")).expect("writable");
+}
+
 /// Adds small settings.
 fn shrink(args: &mut Vec<String>) {
     let command = args[0].clone();
@@ -201,7 +213,6 @@ fn shrink(args: &mut Vec<String>) {
             // The scenes of re10k-mini are short.
             args.retain(|arg| arg != "--set" && arg != "eval.num_context=4");
             set(args, &["eval.num_context=2"]);
-            set(args, &["data.width=24", "data.height=16"]);
         }
         ("import", _) => {
             // The shapes of the DL3DV network determine its heads.
@@ -315,6 +326,7 @@ fn prepare(base: &Path) {
         copy(&base.join("runs/tiny"), name);
     }
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
+    take_small_images(base, &["-o".into(), "models/re10k".into()]);
     let mut rooms = ["train", "configs/rooms.toml"].map(str::to_owned).to_vec();
     shrink(&mut rooms);
     rooms.extend(["--set", "run_dir=runs/rooms"].map(str::to_owned));

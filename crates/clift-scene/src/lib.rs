@@ -22,10 +22,11 @@ pub use error::SceneError;
 // Encode images
 pub use encode::cluster_map::ClusterMap;
 pub use encode::coding::Coding;
-pub use encode::contexts::{ContextChoice, Contexts};
-pub use encode::encode::{EncodeOptions, EncodedScene, encode};
+pub use encode::contexts::Contexts;
+pub use encode::encode::{EncodedScene, encode};
 pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
 pub use encode::names::{find_scene, frame_positions};
+pub use encode::options::{ContextChoice, EncodeOptions};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::frame_size::check_frames;

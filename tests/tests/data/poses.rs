@@ -8,6 +8,7 @@ use crate::support::{BINARY, Place, Ran, finish, repository, signal, start, wait
 /// Writes the options of COLMAP 3.8 and a small and a large model. `fail` and `wait` hold the command that fails or hangs.
 const FAKE_COLMAP: &str = r#"#!/bin/sh
 PATH=/usr/bin:/bin
+here=$PWD
 cd "$(dirname "$0")"
 if [ "$1" = help ]; then exit; fi
 if [ "$2" = -h ]; then
@@ -20,9 +21,10 @@ if [ "$(cat fail 2>/dev/null)" = "$1" ]; then echo "Check failed: no screen"; ex
 if [ "$(cat wait 2>/dev/null)" = "$1" ]; then touch waiting; exec sleep 600; fi
 if [ "$1" = mapper ]; then
     while [ "$1" != --output_path ]; do shift; done
-    mkdir "$2/0" "$2/1"
-    printf '\2\0\0\0\0\0\0\0' > "$2/0/images.bin"
-    cp MODEL/cameras.bin MODEL/images.bin "$2/1"
+    out=$(cd "$here" && realpath "$2")
+    mkdir "$out/0" "$out/1"
+    printf '\2\0\0\0\0\0\0\0' > "$out/0/images.bin"
+    cp MODEL/cameras.bin MODEL/images.bin "$out/1"
 fi
 "#;
 

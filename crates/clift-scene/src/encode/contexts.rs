@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 
 use clift_core::{Pose, PoseNormalization, ViewDistance};
 use clift_data::{ClipReader, DataError, contexts_along_path};
-use clift_model::{ModelConfig, ModelError, TokenCount};
+use clift_model::{ModelError, TokenCount};
 
-use crate::encode::encode::EncodeOptions;
 use crate::encode::groups::{nearest_views, neighbour_groups};
+use crate::encode::options::{ContextChoice, EncodeOptions};
 use crate::error::SceneError;
 use crate::scene::scene::ContextGroup;
 
@@ -17,41 +17,6 @@ const MAX_VIEWS: usize = 128;
 const GROUPS_PER_VIEW: f64 = 0.75;
 /// Fewest stored tokens of a group, by default.
 const MIN_TOKENS: usize = 32;
-
-/// The context views of a scene, and which of them are encoded together.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum ContextChoice {
-    /// These frames, encoded together.
-    Frames(Vec<usize>),
-    /// A number of frames at equal distances along the camera path, or all frames of a shorter path, encoded together.
-    Spread(usize),
-    /// A frame and those nearest to it, encoded together.
-    Near {
-        /// The frame.
-        frame: usize,
-        /// Number of views with the frame.
-        num_views: usize,
-    },
-    /// All frames, of a long path 128, in overlapping groups of neighbours.
-    Neighbours {
-        /// Views of a group.
-        num_views: usize,
-        /// Number of groups, of which few leave views out; `None` for three for every four views, and more where these leave a
-        /// view out, but for no more than one for every 32 of a number of stored tokens.
-        num_groups: Option<usize>,
-    },
-}
-
-impl ContextChoice {
-    /// Returns the default for a captured scene and a network that was trained with up to `num_views` views: groups of
-    /// neighbours; of learned tokens, which have no place, views along the path.
-    pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
-        match model.has_patch_tokens() {
-            true => Self::Neighbours { num_views, num_groups: None },
-            false => Self::Spread(num_views),
-        }
-    }
-}
 
 /// The context views of a scene.
 #[derive(Clone, Debug, PartialEq)]

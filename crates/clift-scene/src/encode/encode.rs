@@ -2,47 +2,13 @@
 // N encoder tokens, S stored tokens, D width
 
 use clift_core::{ClipViews, derive_seed};
-use clift_data::{ClipReader, ViewIndices, ViewSampler};
-use clift_model::{Clusters, Grouping, KMeans, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
+use clift_data::{ClipReader, ViewIndices};
+use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
 
-use crate::encode::contexts::{ContextChoice, Contexts};
+use crate::encode::contexts::Contexts;
+use crate::encode::options::EncodeOptions;
 use crate::error::SceneError;
 use crate::scene::scene::{ContextGroup, Scene};
-
-/// Settings of [`encode`].
-#[derive(Clone, Debug, PartialEq)]
-pub struct EncodeOptions {
-    /// Context views and their groups.
-    pub context: ContextChoice,
-    /// One of this many frames is not a context view, 0 for none.
-    pub hold_out: usize,
-    /// Number of stored tokens of all groups; `None` for a quarter, down to an eighth
-    /// of many groups, or for all tokens of a network without clusters.
-    pub stored_tokens: Option<TokenCount>,
-    /// Token groups that the model was trained on.
-    pub grouping: Grouping,
-    /// Latent K-means.
-    pub kmeans: KMeans,
-    /// Seed of the run.
-    pub seed: u64,
-    /// Path of the model for the scene file, see [`Scene::model_path_for`].
-    pub model_path: String,
-}
-
-impl Default for EncodeOptions {
-    /// The options for the default config of a run.
-    fn default() -> Self {
-        Self {
-            context: ContextChoice::Spread(ViewSampler::default().max_context),
-            hold_out: 0,
-            stored_tokens: None,
-            grouping: Grouping::default(),
-            kmeans: KMeans::default(),
-            seed: 0,
-            model_path: String::new(),
-        }
-    }
-}
 
 /// An encoded scene.
 #[derive(Clone, Debug)]

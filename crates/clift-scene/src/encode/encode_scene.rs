@@ -8,7 +8,8 @@ use clift_model::TrainedModel;
 use crate::check::view_check::CheckedView;
 use crate::encode::coding::{Coder, Coding};
 use crate::encode::contexts::Contexts;
-use crate::encode::encode::{EncodeOptions, EncodedScene, encode};
+use crate::encode::encode::{EncodedScene, encode};
+use crate::encode::options::EncodeOptions;
 use crate::error::SceneError;
 use crate::fit::step_choice::{expected_step, step_for_bytes, step_for_loss};
 

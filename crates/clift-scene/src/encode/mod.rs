@@ -1,6 +1,7 @@
 //! Encoding of captured images, up to the scene file.
 //!
 //! - `names`: scenes by key, frames by position or file name
+//! - `options`: the settings
 //! - `contexts`: the context views, by default groups of neighbours (`groups`), and their directions
 //! - `encode`: tokens, clusters, condenser
 //! - `cluster_map`: the clusters for a JSON file
@@ -14,3 +15,4 @@ pub(crate) mod encode;
 pub(crate) mod encode_scene;
 pub(crate) mod groups;
 pub(crate) mod names;
+pub(crate) mod options;

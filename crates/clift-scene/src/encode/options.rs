@@ -1,0 +1,74 @@
+//! Settings of the encoding, and which frames are context views.
+
+use clift_data::ViewSampler;
+use clift_model::{Grouping, KMeans, ModelConfig, TokenCount};
+
+/// Settings of [`encode`](crate::encode).
+#[derive(Clone, Debug, PartialEq)]
+pub struct EncodeOptions {
+    /// Context views and their groups.
+    pub context: ContextChoice,
+    /// One of this many frames is not a context view, 0 for none.
+    pub hold_out: usize,
+    /// Number of stored tokens of all groups; `None` for a quarter, down to an eighth
+    /// of many groups, or for all tokens of a network without clusters.
+    pub stored_tokens: Option<TokenCount>,
+    /// Token groups that the model was trained on.
+    pub grouping: Grouping,
+    /// Latent K-means.
+    pub kmeans: KMeans,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Path of the model for the scene file, see [`Scene::model_path_for`].
+    pub model_path: String,
+}
+
+impl Default for EncodeOptions {
+    /// The options for the default config of a run.
+    fn default() -> Self {
+        Self {
+            context: ContextChoice::Spread(ViewSampler::default().max_context),
+            hold_out: 0,
+            stored_tokens: None,
+            grouping: Grouping::default(),
+            kmeans: KMeans::default(),
+            seed: 0,
+            model_path: String::new(),
+        }
+    }
+}
+
+/// The context views of a scene, and which of them are encoded together.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ContextChoice {
+    /// These frames, encoded together.
+    Frames(Vec<usize>),
+    /// A number of frames at equal distances along the camera path, or all frames of a shorter path, encoded together.
+    Spread(usize),
+    /// A frame and those nearest to it, encoded together.
+    Near {
+        /// The frame.
+        frame: usize,
+        /// Number of views with the frame.
+        num_views: usize,
+    },
+    /// All frames, of a long path 128, in overlapping groups of neighbours.
+    Neighbours {
+        /// Views of a group.
+        num_views: usize,
+        /// Number of groups, of which few leave views out; `None` for three for every four views, and more where these leave a
+        /// view out, but for no more than one for every 32 of a number of stored tokens.
+        num_groups: Option<usize>,
+    },
+}
+
+impl ContextChoice {
+    /// Returns the default for a captured scene and a network that was trained with up to `num_views` views: groups of
+    /// neighbours; of learned tokens, which have no place, views along the path.
+    pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
+        match model.has_patch_tokens() {
+            true => Self::Neighbours { num_views, num_groups: None },
+            false => Self::Spread(num_views),
+        }
+    }
+}
