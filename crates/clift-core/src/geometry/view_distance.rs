@@ -51,7 +51,7 @@ mod tests {
         for (a, b, expected) in [(0, 0, 0.0), (0, 1, 1.0 / 1.5), (2, 3, 1.0 / 1.5 + std::f64::consts::FRAC_PI_2)] {
             assert!((distance.between(&views[a], &views[b]) - expected).abs() < 1e-12, "{a} to {b}");
         }
-        let expected = (0.0 + 1.0 / 1.5) / 2.0;
+        let expected = 0.5 / 1.5;
         assert!((distance.to_group(&views[0], &views[..2]) - expected).abs() < 1e-12, "mean plus smallest");
         let turning = [view(5.0, 0.0), view(5.0, 30.0)];
         let angle = ViewDistance::new(&turning).between(&turning[0], &turning[1]);

@@ -148,7 +148,7 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
 
 /// Returns the number of evaluated scenes, and the reasons of the skipped scenes.
 pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
-    let rows = html! { @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (text(&reason)) } } } };
+    let rows = html! { @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (text(reason)) } } } };
     html! {
         h2 { "Skipped scenes" }
         p { (count(num_evaluated)) " of " (count(skip_report.num_scenes)) " scenes were evaluated." }

@@ -123,7 +123,7 @@ fn choose_frames(poses: &[Pose], choice: &ContextChoice, held_out: &[usize]) -> 
                 let fix = if frame < num_frames { "the frame is held out".into() } else { no_frame(frame) };
                 return Err(bad("--near", frame.to_string(), fix));
             };
-            nearest_views(&kept_poses, &ViewDistance::new(&kept_poses), position, num_views)
+            nearest_views(&kept_poses, ViewDistance::new(&kept_poses), position, num_views)
         }
         ContextChoice::Spread(num_views) => spread(num_views)?,
         ContextChoice::Neighbours { .. } => spread(MAX_VIEWS)?,

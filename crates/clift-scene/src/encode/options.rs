@@ -66,9 +66,10 @@ impl ContextChoice {
     /// Returns the default for a captured scene and a network that was trained with up to `num_views` views: groups of
     /// neighbours; of learned tokens, which have no place, views along the path.
     pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
-        match model.has_patch_tokens() {
-            true => Self::Neighbours { num_views, num_groups: None },
-            false => Self::Spread(num_views),
+        if model.has_patch_tokens() {
+            Self::Neighbours { num_views, num_groups: None }
+        } else {
+            Self::Spread(num_views)
         }
     }
 }

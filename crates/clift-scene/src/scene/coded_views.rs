@@ -71,7 +71,9 @@ pub(crate) fn write_groups(groups: &[ContextGroup], body: &mut Vec<u8>) {
     body.extend(numbers.flat_map(|number| (number as u16).to_le_bytes()));
     body.resize(start + (body.len() - start).next_multiple_of(4), 0);
     if groups.len() > 1 {
-        groups.iter().for_each(|group| write_world(&group.frame, body));
+        for group in groups {
+            write_world(&group.frame, body);
+        }
     }
 }
 

@@ -20,7 +20,9 @@ pub(crate) fn group_shares(distances: &[f64]) -> Vec<(usize, f64)> {
         return vec![(nearest, 1.0)];
     }
     let sum: f64 = near.iter().map(|(_, room)| room).sum();
-    near.iter_mut().for_each(|(_, room)| *room /= sum);
+    for (_, room) in &mut near {
+        *room /= sum;
+    }
     near
 }
 

@@ -409,7 +409,8 @@ mod tests {
                     let got = whole.render(&[view], 16, 24, count).unwrap().remove(0);
                     assert_eq!(got.pixels, expected.pixels, "group {group}, {count} tokens");
                     assert_eq!(got.tokens.unwrap().len(), count);
-                    (alone.reset(), whole.reset());
+                    alone.reset();
+                    whole.reset();
                 }
             }
         }
