@@ -19,7 +19,7 @@ pub struct EncodeOptions {
     pub kmeans: KMeans,
     /// Seed of the run.
     pub seed: u64,
-    /// Path of the model for the scene file, see [`Scene::model_path_for`].
+    /// Path of the model for the scene file, see [`Scene::model_path_for`](crate::Scene::model_path_for).
     pub model_path: String,
 }
 
