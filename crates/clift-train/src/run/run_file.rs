@@ -135,7 +135,7 @@ pub(crate) fn open_folder(config: &Config, options: &RunOptions, sink: &mut dyn 
 /// Locks the run that `path` is, or is the stage folder or the weight file of; `None` for other models.
 ///
 /// # Errors
-/// As [`RunLock::take`].
+/// As for a run that another process has locked, and those of the file system.
 pub fn lock_run(path: &Path, sink: &mut dyn Sink) -> Result<Option<RunLock>, TrainError> {
     let run = path.ancestors().take(3).find(|folder| folder.join(FILE).is_file());
     run.map(|folder| RunLock::take(folder, LockedFolder::FittedRun, sink)).transpose()
