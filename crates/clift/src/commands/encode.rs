@@ -147,15 +147,16 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     if let Some(file) = clusters {
         file.write_json(&ClusterMap::new(&written.encoded))?;
     }
-    print(&written, &args.out, given)
+    print(&written, &args.out, &model_args)
 }
 
-fn print(written: &WrittenScene, out: &Path, model: &Path) -> anyhow::Result<()> {
+fn print(written: &WrittenScene, out: &Path, model: &ModelArgs) -> anyhow::Result<()> {
     print_result(&describe(written, out))?;
     if let (Some([width, height]), [w, h]) = (written.cropped, written.image_size) {
         print_note(&format!("of images of {w} x {h}, the central {width} x {height} pixels are used"));
     }
-    print_contexts(written)?;
+    // Contexts of a run's own data show how well it is trained, not how far apart they are.
+    print_contexts(written, model.folder.is_some())?;
     match written.others[..] {
         [] => Ok(()),
         [CheckedView { frame, psnr, baseline_psnr }] => {
@@ -168,7 +169,7 @@ fn print(written: &WrittenScene, out: &Path, model: &Path) -> anyhow::Result<()>
                 print_warning(format!(
                     "the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
                      from the training scenes of {}, few tokens are stored, or the run is not trained enough",
-                    model.display()
+                    model.given.display()
                 ));
             }
             Ok(())
@@ -192,8 +193,8 @@ fn print(written: &WrittenScene, out: &Path, model: &Path) -> anyhow::Result<()>
     }
 }
 
-/// Prints how well the context views come out, and warns of fog.
-fn print_contexts(written: &WrittenScene) -> anyhow::Result<()> {
+/// Prints how well the context views come out; of a capture, warns of fog.
+fn print_contexts(written: &WrittenScene, is_capture: bool) -> anyhow::Result<()> {
     let psnrs: Vec<f64> = written.contexts.iter().map(|view| view.psnr).collect();
     let fog: Vec<String> =
         written.contexts.iter().filter(|view| view.is_fog()).map(|view| written.frame_name(view.frame)).collect();
@@ -201,7 +202,7 @@ fn print_contexts(written: &WrittenScene) -> anyhow::Result<()> {
         "check: the context views are rendered at {:.2} dB",
         clift_core::mean(&psnrs).unwrap_or_default()
     ))?;
-    if !fog.is_empty() {
+    if is_capture && !fog.is_empty() {
         let more = if fog.len() > MAX_LISTED { ", .." } else { "" };
         print_warning(format!(
             "{} of {} context views are rendered below {MIN_CONTEXT_PSNR} dB or worse than the mean image, as fog: {}{more}; \
