@@ -15,12 +15,7 @@ const CRATES: [Crate; 11] = [
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    (
-        "clift-cube",
-        "",
-        "buffer load elementwise gelu epilogue reduce adamw cluster_attention head_rows head_transform layer_norm rms_norm product_kind register_product \
-         matrix_product register_scores matrix_scores register_attention matrix_attention adapter product attention",
-    ),
+    ("clift-cube", "", "adapter buffers rows products attention"),
     (
         "clift-model",
         "clift-core clift-cube clift-kernels",

@@ -55,7 +55,7 @@ fn time_products(client: &Client, class: AdapterClass, divisor: usize) {
     }
 }
 
-/// Returns all tiles that are worth a try on an adapter.
+/// Returns the tiles to time on an adapter.
 fn tiles(class: AdapterClass) -> Vec<ProductTile> {
     let registers =
         [([128, 128, 16], [8, 8]), ([64, 128, 16], [4, 8]), ([64, 64, 16], [4, 4]), ([128, 128, 8], [8, 8])];
@@ -81,15 +81,15 @@ fn wait(client: &Client) {
     cubecl::future::block_on(client.sync()).expect("a device that works");
 }
 
-/// Returns the milliseconds of the first run, which compiles, and of one of the others, as fields of an object, or why the
-/// kernel does not run.
+/// Returns the milliseconds of the first run, which compiles, and the mean of the later runs, as fields of an object, or the
+/// error of the kernel.
 fn time(client: &Client, work: f64, run: impl Fn() -> Vec<Buffer>) -> String {
     wait(client);
     let start = Instant::now();
     let results = run();
     wait(client);
     let first = start.elapsed();
-    // A refused launch is an error of those who read its result.
+    // The error of a refused launch appears when its result is read.
     for buffer in results {
         let end = buffer.handle.size().saturating_sub(256);
         if let Err(error) = client.read_one(buffer.handle.offset_start(end)) {

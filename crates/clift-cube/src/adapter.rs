@@ -1,20 +1,24 @@
-//! What an adapter multiplies with, and the tiles chosen for it.
+//! Matrix instructions of an adapter.
 
 use cubecl::features::{MmaConfig, Plane};
 use cubecl::prelude::*;
 use half::f16;
 
-use crate::buffer::Values;
-use crate::matrix_product::{MatrixShape, MatrixTile};
-use crate::matrix_scores::AttentionTile;
-use crate::register_product::RegisterTile;
+/// Shape of the cooperative matrices of an adapter: f16 operands, f32 sums.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct MatrixShape {
+    /// M, N, K.
+    pub sizes: [usize; 3],
+    /// Units of a plane.
+    pub plane: usize,
+}
 
 /// Class of an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum AdapterClass {
     /// Cooperative matrices with f16 operands and f32 sums.
     Matrices(MatrixShape),
-    /// None.
+    /// No cooperative matrices: sums in registers, in f32.
     Registers,
 }
 
@@ -34,55 +38,5 @@ impl AdapterClass {
         };
         let size = [16, 8].into_iter().find(|&size| has(size) && plane.is_multiple_of(size as usize));
         size.map_or(Self::Registers, |size| Self::Matrices(MatrixShape { sizes: [size as usize; 3], plane }))
-    }
-
-    /// Returns the tile of a product with operands of a type.
-    pub(crate) fn product_tile(self, operands: Values, [m, n, _k]: [usize; 3]) -> ProductTile {
-        match self {
-            Self::Matrices(shape) if operands == Values::F16 => {
-                // Matrices of 8 x 8 x 8 are software's.
-                let (stage, planes) = match (shape.sizes[0], m.min(n)) {
-                    (16, 96..) => ([128, 128, 32], [2, 4]),
-                    (16, _) => ([64, 64, 32], [2, 2]),
-                    _ => ([32, 32, 16], [2, 2]),
-                };
-                ProductTile::Matrix(MatrixTile { shape, stage, planes })
-            }
-            _ if m.min(n) >= 96 => ProductTile::Register(RegisterTile { stage: [128, 128, 16], unit: [8, 8] }),
-            _ => ProductTile::Register(RegisterTile { stage: [64, 64, 16], unit: [4, 4] }),
-        }
-    }
-
-    /// Returns the tiles of attention, forward and backward, with operands of a type; `None` for register tiles, which have one.
-    pub(crate) fn attention_tiles(self, operands: Values, width: usize) -> [Option<AttentionTile>; 2] {
-        let Self::Matrices(shape) = self else { return [None; 2] };
-        let (planes, columns) = if shape.sizes[0] == 16 { ([8, 4], 32) } else { ([4, 4], 16) };
-        planes.map(|planes| (operands == Values::F16).then_some(AttentionTile { shape, planes, columns, width }))
-    }
-}
-
-/// Tile of a product.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ProductTile {
-    /// Sums in registers, in f32.
-    Register(RegisterTile),
-    /// Cooperative matrices, of operands in f16.
-    Matrix(MatrixTile),
-}
-
-impl ProductTile {
-    /// Rows, columns and terms of a stage.
-    pub(crate) fn stage(self) -> [usize; 3] {
-        match self {
-            Self::Register(tile) => tile.stage,
-            Self::Matrix(tile) => tile.stage,
-        }
-    }
-
-    pub(crate) fn units(self) -> usize {
-        match self {
-            Self::Register(tile) => tile.num_units(),
-            Self::Matrix(tile) => tile.num_planes() * tile.shape.plane,
-        }
     }
 }

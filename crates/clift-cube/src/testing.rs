@@ -7,8 +7,8 @@ use cubecl::prelude::*;
 use cubecl::wgpu::{WgpuServer, WgslCompiler};
 
 use crate::adapter::AdapterClass;
-use crate::buffer::{Buffer, Matrices, Values};
-use crate::matrix_product::MatrixShape;
+use crate::adapter::MatrixShape;
+use crate::buffers::buffer::{Buffer, Values};
 
 /// Returns a client of the default adapter, with kernels in SPIR-V if `CLIFT_CUBE_SPIRV` is set, in WGSL otherwise. Without an
 /// adapter prints that the test is skipped, or fails if `CLIFT_REQUIRE_WGPU` is set.
@@ -38,7 +38,8 @@ fn skipped<T>(tool: &str, reason: &str) -> Option<T> {
     let variable = format!("CLIFT_REQUIRE_{tool}");
     assert!(std::env::var_os(&variable).is_none(), "{variable} is set: {reason}");
     let thread = std::thread::current();
-    let line = format!("skipped: {}: {reason}\n", thread.name().unwrap_or(tool));
+    let test = thread.name().filter(|name| *name != "main").unwrap_or(tool);
+    let line = format!("skipped: {test}: {reason}\n");
     // Not `eprintln`, whose output the harness hides.
     std::io::stderr().write_all(line.as_bytes()).expect("the standard error is open");
     None
@@ -76,11 +77,6 @@ pub(crate) fn read(client: &Client, x: &Buffer) -> Vec<f32> {
 /// Rounds to f16.
 pub(crate) fn rounded(x: f32) -> f32 {
     half::f16::from_f32(x).to_f32()
-}
-
-/// Returns one matrix, row after row.
-pub(crate) fn matrices(buffer: &Buffer, columns: usize) -> Matrices<'_> {
-    Matrices::contiguous(buffer, columns)
 }
 
 /// Returns the complementary error function, by Simpson's rule.

@@ -1,6 +1,6 @@
 //! Reads a scene file and prints its contents.
 //!
-//! `cargo run --release -p clift-model --example read_scene -- room.clift`
+//! `cargo run --release -p clift-scene --example read_scene -- room.clift`
 
 use std::path::Path;
 

@@ -1,15 +1,17 @@
 //! Reads frames of a scene as a clip at the model's size, with normalised poses.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::Arc;
 
 use clift_core::{
-    Camera, ClipViews, Intrinsics, IntrinsicsNorm, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near,
+    Camera, ClipViews, IntrinsicsNorm, Pose, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near,
 };
 
 use crate::error::DataError;
 use crate::image::fit::fit_image;
 use crate::sampling::clip::{Clip, ViewIndices};
+use crate::sampling::half_resolution::at_half_resolution;
 use crate::scene_source::SceneSource;
 
 /// Options for the preparation of frames and poses.
@@ -62,52 +64,90 @@ impl ClipReader {
     /// fitting ([`DataError::Upscale`]) and of normalising ([`DataError::Camera`]).
     pub fn read(&self, scene: usize, views: &ViewIndices) -> Result<Clip, DataError> {
         let key = self.source.key(scene);
-        let cameras = self.source.cameras(scene)?;
-        let frames = views.context.iter().chain(&views.target);
-        if let Some(&frame) = frames.clone().find(|frame| **frame >= cameras.len()) {
-            return Err(DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames: cameras.len() });
-        }
-        for &frame in frames.clone() {
-            cameras[frame].c2w.check_finite().map_err(DataError::in_frame(key, frame))?;
-        }
+        let frames = [&views.context[..], &views.target].concat();
+        let cameras = self.cameras(scene, &frames)?;
         let poses = |frames: &[usize]| frames.iter().map(|frame| cameras[*frame].c2w).collect::<Vec<_>>();
         let (context, target) = (poses(&views.context), poses(&views.target));
         let ClipOptions { pose_rotation, pose_scale, .. } = self.options;
         let normalization = PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale)?;
-        for &frame in frames.clone() {
-            check_near(&normalization.normalize(cameras[frame].c2w)).map_err(DataError::in_frame(key, frame))?;
-        }
-        let mut fitted = HashMap::new();
-        for &frame in frames {
-            if let std::collections::hash_map::Entry::Vacant(entry) = fitted.entry(frame) {
-                entry.insert(self.fitted(scene, frame, cameras[frame].intrinsics)?);
-            }
-        }
-        let camera = |frame: &usize| {
-            let c2w = normalization.normalize(cameras[*frame].c2w);
-            Camera { c2w, intrinsics: fitted[frame].1 }
-        };
-        let gather = |frames: &[usize]| ClipViews {
-            width: self.options.width,
-            height: self.options.height,
-            images: frames.iter().flat_map(|frame| &fitted[frame].0.rgb).copied().collect(),
-            cameras: frames.iter().map(camera).collect(),
-            frame_index: frames.to_vec(),
-        };
+        let fitted = self.fit_frames(scene, &frames, &cameras, &normalization)?;
         let num_pixels = self.options.width * self.options.height;
-        let weights = |frame: &usize| fitted[frame].2.clone().unwrap_or_else(|| vec![u8::MAX; num_pixels]);
-        let has_weights = views.target.iter().any(|frame| fitted[frame].2.is_some());
+        let weights = |frame: &usize| fitted[frame].weights.clone().unwrap_or_else(|| vec![u8::MAX; num_pixels]);
+        let has_weights = views.target.iter().any(|frame| fitted[frame].weights.is_some());
         let clip = Clip {
             key: key.to_owned(),
-            context: gather(&views.context),
-            target: gather(&views.target),
+            context: self.gather(&views.context, &fitted),
+            target: self.gather(&views.target, &fitted),
             target_weights: has_weights.then(|| views.target.iter().flat_map(weights).collect()),
         };
         Ok(if self.options.half_size { clip.at_half_resolution() } else { clip })
     }
 
-    /// Returns the image, its intrinsics, and the weights of its pixels if some are left out.
-    fn fitted(&self, scene: usize, frame: usize, intrinsics: IntrinsicsNorm) -> Result<Fitted, DataError> {
+    /// Reads frames as [`read`](Self::read) does, with the poses of a normalization that is known already.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read).
+    pub fn read_views(
+        &self,
+        scene: usize,
+        frames: &[usize],
+        normalization: &PoseNormalization,
+    ) -> Result<ClipViews, DataError> {
+        let cameras = self.cameras(scene, frames)?;
+        let views = self.gather(frames, &self.fit_frames(scene, frames, &cameras, normalization)?);
+        Ok(if self.options.half_size { at_half_resolution(&views) } else { views })
+    }
+
+    /// Returns the cameras of a scene, after a check of those of `frames`.
+    fn cameras(&self, scene: usize, frames: &[usize]) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
+        let (key, cameras) = (self.source.key(scene), self.source.cameras(scene)?);
+        if let Some(&frame) = frames.iter().find(|frame| **frame >= cameras.len()) {
+            return Err(DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames: cameras.len() });
+        }
+        for &frame in frames {
+            cameras[frame].c2w.check_finite().map_err(DataError::in_frame(key, frame))?;
+        }
+        Ok(cameras)
+    }
+
+    /// Reads every distinct frame once, after a check of all normalised poses.
+    fn fit_frames(
+        &self,
+        scene: usize,
+        frames: &[usize],
+        cameras: &[Camera<IntrinsicsNorm>],
+        normalization: &PoseNormalization,
+    ) -> Result<HashMap<usize, FittedFrame>, DataError> {
+        let c2w = |frame: usize| normalization.normalize(cameras[frame].c2w);
+        for &frame in frames {
+            check_near(&c2w(frame)).map_err(DataError::in_frame(self.source.key(scene), frame))?;
+        }
+        let mut fitted = HashMap::new();
+        for &frame in frames {
+            if let Entry::Vacant(entry) = fitted.entry(frame) {
+                entry.insert(self.fit_frame(scene, frame, cameras[frame].intrinsics, c2w(frame))?);
+            }
+        }
+        Ok(fitted)
+    }
+
+    fn gather(&self, frames: &[usize], fitted: &HashMap<usize, FittedFrame>) -> ClipViews {
+        ClipViews {
+            width: self.options.width,
+            height: self.options.height,
+            images: frames.iter().flat_map(|frame| &fitted[frame].image.rgb).copied().collect(),
+            cameras: frames.iter().map(|frame| fitted[frame].camera).collect(),
+            frame_index: frames.to_vec(),
+        }
+    }
+
+    fn fit_frame(
+        &self,
+        scene: usize,
+        frame: usize,
+        intrinsics: IntrinsicsNorm,
+        c2w: Pose,
+    ) -> Result<FittedFrame, DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
         let fit = |image: &RgbImage| {
             fit_image(image, intrinsics, width, height, exact_principal_point)
@@ -117,18 +157,23 @@ impl ClipReader {
         let weights = coverage.map(|coverage| fit(&coverage)).transpose()?;
         let weights = weights.map(|(coverage, _)| coverage.rgb.into_iter().step_by(3).collect());
         let (image, intrinsics) = fit(&image)?;
-        Ok((image, intrinsics, weights))
+        Ok(FittedFrame { image, camera: Camera { c2w, intrinsics }, weights })
     }
 }
 
-type Fitted = (RgbImage, Intrinsics, Option<Vec<u8>>);
+/// A frame of the configured size.
+struct FittedFrame {
+    image: RgbImage,
+    camera: Camera,
+    /// Weights of the pixels if some are left out.
+    weights: Option<Vec<u8>>,
+}
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::scene_source::Split;
     use crate::testing::{TestSource, re10k_mini};
-    use clift_core::Pose;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     fn options() -> ClipOptions {

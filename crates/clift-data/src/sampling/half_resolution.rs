@@ -38,7 +38,7 @@ fn halved_planes(pixels: &[u8], views: &ClipViews) -> Vec<u8> {
     halved
 }
 
-fn at_half_resolution(views: &ClipViews) -> ClipViews {
+pub(crate) fn at_half_resolution(views: &ClipViews) -> ClipViews {
     let (width, height) = (views.width / 2, views.height / 2);
     let images = halved_planes(&views.images, views);
     let halved = |camera: &Camera| Camera {

@@ -1,7 +1,7 @@
 //! Checks of an encoded scene: renderings of frames that are not context views, and of the context views, beside the photos.
 
-use clift_core::Camera;
-use clift_data::{ClipReader, ViewIndices};
+use clift_core::{ClipViews, Pose};
+use clift_data::ClipReader;
 use clift_model::{SelectionPreset, TrainedModel, psnr};
 
 use crate::check::baselines::{mean_image, nearest_image, view_image};
@@ -27,36 +27,39 @@ pub struct CheckedView {
 }
 
 impl CheckedView {
-    /// Renders frames that are not context views: all that are `held_out`, or without any the frame farthest from the
-    /// contexts, by number, between the first and the last; without one, the nearest beside them. `scene` was encoded by `model`
-    /// from scene `index` of `reader`. Returns none if every frame is a context, or no other frame is readable.
+    /// Compares renderings of `views` with copies of the nearest of the `context` views.
     ///
     /// # Errors
-    /// The errors of the model.
-    pub fn other_frames(
-        model: &TrainedModel,
-        (reader, index): (&ClipReader, usize),
-        scene: &Scene,
-        held_out: &[usize],
+    /// The errors of rendering.
+    pub fn others(
+        renderer: &mut SceneRenderer,
+        views: &ClipViews,
+        context: &ClipViews,
     ) -> Result<Vec<Self>, SceneError> {
-        let views = match held_out {
-            [] => CheckViews::read(reader, index, scene, 1)?,
-            _ => Some(CheckViews::of_frames(reader, index, scene, held_out)?),
-        };
-        views.map_or(Ok(Vec::new()), |views| views.render(model, scene, |view| &views.nearest[view]))
+        Self::compare(renderer, views, |c2w| nearest_image(context, c2w))
     }
 
-    /// Renders the context views.
+    /// Compares renderings of the context views with the mean of their images.
     ///
     /// # Errors
-    /// Those of reading the images, and of the model.
-    pub fn contexts(
-        model: &TrainedModel,
-        (reader, index): (&ClipReader, usize),
-        scene: &Scene,
+    /// The errors of rendering.
+    pub fn contexts(renderer: &mut SceneRenderer, context: &ClipViews) -> Result<Vec<Self>, SceneError> {
+        let mean = mean_image(context)?;
+        Self::compare(renderer, context, |_| Ok(mean.clone()))
+    }
+
+    fn compare(
+        renderer: &mut SceneRenderer,
+        views: &ClipViews,
+        baseline: impl Fn(Pose) -> Result<Vec<f32>, SceneError>,
     ) -> Result<Vec<Self>, SceneError> {
-        let views = CheckViews::contexts(reader, index, scene)?;
-        views.render(model, scene, |_| &views.mean)
+        let rendered = render_views(renderer, views)?;
+        let view = |(view, pixels): (usize, Vec<f32>)| {
+            let truth = view_image(views, view);
+            let baseline_psnr = psnr(&baseline(views.cameras[view].c2w)?, &truth)?;
+            Ok(Self { frame: views.frame_index[view], psnr: psnr(&pixels, &truth)?, baseline_psnr })
+        };
+        rendered.into_iter().enumerate().map(view).collect()
     }
 
     /// Whether the rendering of a context view is fog.
@@ -65,89 +68,29 @@ impl CheckedView {
     }
 }
 
-/// Frames of a scene with true images, in the poses of its file.
-pub(crate) struct CheckViews {
-    pub frames: Vec<usize>,
-    pub cameras: Vec<Camera>,
-    /// RGB in `[0, 1]` of all frames, `[V, height, width, 3]`.
-    pub truth: Vec<f32>,
-    /// Height and width.
-    pub size: [usize; 2],
-    /// The context view nearest to every frame.
-    pub nearest: Vec<Vec<f32>>,
-    /// Mean of the context images.
-    pub mean: Vec<f32>,
-}
-
-impl CheckViews {
-    /// Reads up to `count` frames that are not context views, the first [`candidates`]; `None` if none is readable.
-    pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, SceneError> {
-        let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
-        let frames = candidates(&context, reader.source.cameras(index)?.len());
-        for frames in frames.chunks(count).take(MAX_TRIES) {
-            if let Ok(views) = Self::of_frames(reader, index, scene, frames) {
-                return Ok(Some(views));
-            }
-        }
-        Ok(None)
-    }
-
-    /// Reads the contexts.
-    pub fn contexts(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Self, SceneError> {
-        let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
-        Self::of_frames(reader, index, scene, &context)
-    }
-
-    fn of_frames(reader: &ClipReader, index: usize, scene: &Scene, frames: &[usize]) -> Result<Self, SceneError> {
-        let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
-        let cameras = reader.source.cameras(index)?;
-        let mut clip = reader.read(index, &ViewIndices { context, target: frames.to_vec() })?;
-        // The poses of the scene file: `reader` may normalize by the target too.
-        for views in [&mut clip.context, &mut clip.target] {
-            for (camera, &frame) in views.cameras.iter_mut().zip(&views.frame_index) {
-                camera.c2w = scene.world.normalize(cameras[frame].c2w);
-            }
-        }
-        let nearest: Result<Vec<_>, _> =
-            clip.target.cameras.iter().map(|camera| nearest_image(&clip.context, camera.c2w)).collect();
-        Ok(Self {
-            frames: frames.to_vec(),
-            truth: (0..frames.len()).flat_map(|view| view_image(&clip.target, view)).collect(),
-            size: [clip.target.height, clip.target.width],
-            cameras: clip.target.cameras,
-            nearest: nearest?,
-            mean: mean_image(&clip.context)?,
-        })
-    }
-
-    /// Compares renderings of the frames with the photos, and the photos with the `baseline` of each.
-    fn render<'a>(
-        &'a self,
-        model: &TrainedModel,
-        scene: &Scene,
-        baseline: impl Fn(usize) -> &'a [f32],
-    ) -> Result<Vec<CheckedView>, SceneError> {
-        let rendered = render_scene(model, scene, &self.cameras, self.size)?;
-        let views = rendered.iter().zip(self.truth.chunks_exact(self.size[0] * self.size[1] * 3)).enumerate();
-        let view = |(view, (pixels, truth)): (usize, (&Vec<f32>, &[f32]))| {
-            let baseline_psnr = psnr(baseline(view), truth)?;
-            Ok(CheckedView { frame: self.frames[view], psnr: psnr(pixels, truth)?, baseline_psnr })
-        };
-        views.map(view).collect()
-    }
-}
-
-/// Renders views of a scene from all its tokens, `[height, width, 3]` each.
-pub(crate) fn render_scene(
-    model: &TrainedModel,
+/// Reads up to `count` frames that are not context views, with the poses of the scene: of those between the contexts, the
+/// farthest from a context first; without one, the nearest beside them. `None` if none is readable.
+pub(crate) fn read_others(
+    reader: &ClipReader,
+    index: usize,
     scene: &Scene,
-    views: &[Camera],
-    [height, width]: [usize; 2],
-) -> Result<Vec<Vec<f32>>, SceneError> {
-    let rules = SelectionPreset::Paper.rules();
-    let mut renderer = SceneRenderer::new(scene, model.network.renderer.clone(), rules, &model.device)?;
-    let rendered = renderer.render(views, height, width, scene.num_tokens())?;
+    count: usize,
+) -> Result<Option<ClipViews>, SceneError> {
+    let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
+    let frames = candidates(&context, reader.source.num_frames(index)?);
+    Ok(frames.chunks(count).take(MAX_TRIES).find_map(|frames| reader.read_views(index, frames, &scene.world).ok()))
+}
+
+/// Renders views from all tokens, `[height, width, 3]` each.
+pub(crate) fn render_views(renderer: &mut SceneRenderer, views: &ClipViews) -> Result<Vec<Vec<f32>>, SceneError> {
+    let rendered = renderer.render(&views.cameras, views.height, views.width, renderer.max_render_tokens())?;
     Ok(rendered.into_iter().map(|view| view.pixels).collect())
+}
+
+/// Copies the tokens of a scene to the device of its model.
+pub(crate) fn scene_renderer(model: &TrainedModel, scene: &Scene) -> Result<SceneRenderer, SceneError> {
+    let rules = SelectionPreset::Paper.rules();
+    Ok(SceneRenderer::new(scene, model.network.renderer.clone(), rules, &model.device)?)
 }
 
 /// Returns the frames that are not context views: those between the contexts, the farthest from a context first, then the others,

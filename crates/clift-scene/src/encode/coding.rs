@@ -63,16 +63,24 @@ impl Coder {
             },
         })
     }
+}
 
-    /// Returns the number of stored tokens of the best expected PSNR in a file of limited size; `None` without a limit.
-    pub fn best_count(&self, contexts: &Contexts, [height, width]: [usize; 2], model_path: &str) -> Option<TokenCount> {
-        let Self::Bytes(codec, bytes) = self else { return None };
-        let num_members = contexts.num_members();
-        let num_patches = codec.model.num_patches(num_members, height, width).unwrap_or(1);
-        let overhead = coded_overhead(contexts.frames.len(), num_members, model_path.len());
-        let tokens = *bytes as f64 - overhead as f64;
-        Some(TokenCount::Share(codec.rates.share_for_bytes(num_patches, tokens.max(1.0))))
+/// Returns the number of stored tokens of the best expected PSNR in a file of `bytes`: of a single group a share of its tokens, of
+/// several a number, for which there may be fewer groups.
+pub(crate) fn count_for_bytes(
+    (codec, bytes): (&TokenCodec, u64),
+    contexts: &Contexts,
+    [height, width]: [usize; 2],
+    model_path: &str,
+) -> TokenCount {
+    let num_members = contexts.num_members();
+    let num_patches = codec.model.num_patches(num_members, height, width).unwrap_or(1);
+    let tokens = bytes as f64 - coded_overhead(contexts.frames.len(), num_members, model_path.len()) as f64;
+    let share = codec.rates.share_for_bytes(num_patches, tokens.max(1.0));
+    if contexts.groups.len() == 1 {
+        return TokenCount::Share(share);
     }
+    TokenCount::Count(((share * num_patches as f64) as usize).max(1))
 }
 
 /// Bytes of a coded file besides its tokens, about: header, normalization, the views, and the groups.

@@ -64,7 +64,7 @@ impl Contexts {
         let groups = groups.iter().map(|views| {
             let views: Vec<u32> = views.iter().map(position).collect();
             let poses: Vec<Pose> = views.iter().map(|&view| context[view as usize]).collect();
-            // Views that turn in place have no scale of their own.
+            // Views that turn in place, or look in opposite directions, have no frame of their own.
             let frame = find(&poses).unwrap_or(PoseNormalization { mean_c2w: poses[0], scale: 1.0 });
             ContextGroup { views, frame }
         });

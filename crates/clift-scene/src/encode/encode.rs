@@ -2,7 +2,7 @@
 // N encoder tokens, S stored tokens, D width
 
 use clift_core::{ClipViews, derive_seed};
-use clift_data::{ClipReader, ViewIndices};
+use clift_data::ClipReader;
 use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
 
 use crate::encode::contexts::Contexts;
@@ -15,9 +15,11 @@ use crate::scene::scene::{ContextGroup, Scene};
 pub struct EncodedScene {
     /// The scene.
     pub scene: Scene,
+    /// Images and cameras of the context views.
+    pub context: ClipViews,
     /// Number of tokens before clustering.
     pub num_lift_tokens: usize,
-    /// Variance within clusters as a share of the total variance of the tokens.
+    /// Variance within clusters as a share of the total variance of the tokens; the mean of the groups.
     pub cluster_error: f64,
     /// Clusters of the tokens.
     pub clusters: SceneClusters,
@@ -57,26 +59,21 @@ pub fn encode(
 ) -> Result<EncodedScene, SceneError> {
     let (key, data) = (reader.source.key(scene), &reader.options);
     let Contexts { frames, groups, normalization } = Contexts::choose(reader, scene, options)?;
-    let views = ViewIndices { context: frames, target: Vec::new() };
-    let mut clip = reader.read(scene, &views)?;
-    let cameras = reader.source.cameras(scene)?;
-    for (camera, &frame) in clip.context.cameras.iter_mut().zip(&views.context) {
-        camera.c2w = normalization.normalize(cameras[frame].c2w);
-    }
+    let context = reader.read_views(scene, &frames, &normalization)?;
     let sizes: Vec<usize> = groups.iter().map(|group| group.views.len()).collect();
     let counts = token_counts(model, [data.height, data.width], &sizes, options.stored_tokens)?;
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
 
-    let (mut tokens, mut lift) = (Vec::new(), Vec::new());
-    let (mut assignment, mut token_ids) = (Vec::new(), Vec::new());
+    let (mut tokens, mut assignment, mut token_ids) = (Vec::new(), Vec::new(), Vec::new());
+    let mut cluster_error = 0.0;
     for (group, count) in groups.iter().zip(counts) {
-        let encoded = encode_group(model, &members(&clip.context, group), count, options, seed)?;
+        let encoded = encode_group(model, &members(&context, group), count, options, seed)?;
         // Tokens and patches are counted over all groups.
         let (first_cluster, first_patch) = (token_ids.len() as u32, assignment.len() as u32);
         assignment.extend(encoded.clusters.assignment().iter().map(|&cluster| first_cluster + cluster));
         token_ids.extend(encoded.clusters.centroid_index().iter().map(|&patch| first_patch + patch));
         tokens.extend(encoded.tokens);
-        lift.extend(encoded.lift);
+        cluster_error += encoded.cluster_error / groups.len() as f64;
     }
     let clusters = SceneClusters::new(assignment, token_ids.clone())?;
     debug_assert_eq!(tokens.len(), token_ids.len() * model.config.dim, "a row per centroid");
@@ -93,19 +90,18 @@ pub fn encode(
         model_path: options.model_path.clone(),
         height: data.height,
         width: data.width,
-        context: clip.context.cameras,
-        context_frames: views.context.iter().map(|&frame| frame as u32).collect(),
+        context: context.cameras.clone(),
+        context_frames: frames.iter().map(|&frame| frame as u32).collect(),
         groups,
         world: normalization,
         token_ids,
         tokens,
     };
-    let cluster_error = clusters.variance_within(&lift);
-    Ok(EncodedScene { scene, num_lift_tokens: clusters.assignment().len(), cluster_error, clusters })
+    Ok(EncodedScene { scene, context, num_lift_tokens: clusters.assignment().len(), cluster_error, clusters })
 }
 
-/// Returns the share of all tokens that is stored by default: a quarter, of a place with many groups fewer for a file of at most
-/// 400 kB, but an eighth.
+/// Returns the share of all tokens that is stored by default: a quarter, but of many groups an eighth at least and `MOST` tokens
+/// at most, which `models/rooms` codes in about 370 kB.
 fn default_share(num_tokens: usize) -> f64 {
     const MOST: f64 = 7680.0;
     (MOST / num_tokens as f64).clamp(0.125, 0.25)
@@ -153,9 +149,9 @@ fn token_counts(
 struct EncodedGroup {
     /// Stored tokens, `[S, D]`.
     tokens: Vec<f32>,
-    /// Encoder tokens, `[N, D]`.
-    lift: Vec<f32>,
     clusters: SceneClusters,
+    /// As [`EncodedScene::cluster_error`].
+    cluster_error: f64,
 }
 
 fn encode_group(
@@ -166,7 +162,6 @@ fn encode_group(
     seed: u64,
 ) -> Result<EncodedGroup, SceneError> {
     let lift = model.network.encode(&Views::upload(&[views], &model.device)?); // [1, N, D]
-    let lift_values = lift.to_host()?;
     let supports_clusters = model.config.architecture.supports_clusters();
     let clusters = if supports_clusters {
         let grid = [views.height, views.width].map(|side| side / model.config.patch_size);
@@ -175,13 +170,14 @@ fn encode_group(
     } else {
         SceneClusters::identity(count)
     };
+    let cluster_error = clusters.variance_within(&lift.to_host()?);
     let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
     let tokens = match (supports_clusters, model.has_condenser) {
         (false, _) => lift,
         (true, true) => model.network.compress(lift, &index),
         (true, false) => lift.centroids(&index),
     };
-    Ok(EncodedGroup { tokens: tokens.to_host()?, lift: lift_values, clusters })
+    Ok(EncodedGroup { tokens: tokens.to_host()?, clusters, cluster_error })
 }
 
 /// Returns the views of a group, with cameras in its frame.

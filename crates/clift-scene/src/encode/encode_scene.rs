@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clift_data::ClipReader;
 use clift_model::TrainedModel;
 
-use crate::check::view_check::CheckedView;
-use crate::encode::coding::{Coder, Coding};
+use crate::check::view_check::{CheckedView, read_others, scene_renderer};
+use crate::encode::coding::{Coder, Coding, count_for_bytes};
 use crate::encode::contexts::Contexts;
 use crate::encode::encode::{EncodedScene, encode};
 use crate::encode::options::EncodeOptions;
@@ -69,31 +69,40 @@ pub fn encode_scene(
 ) -> Result<WrittenScene, SceneError> {
     let frame_names = reader.source.frame_names(index)?;
     let coder = Coder::new(options.coding, &options.weights, model)?;
-    let contexts = Contexts::choose(reader, index, &options.encode)?;
-    let size = [reader.options.height, reader.options.width];
-    let best = coder.best_count(&contexts, size, &options.encode.model_path);
-    let stored_tokens = options.encode.stored_tokens.or(best);
+    let stored_tokens = match (options.encode.stored_tokens, &coder) {
+        (None, Coder::Bytes(codec, bytes)) => {
+            let contexts = Contexts::choose(reader, index, &options.encode)?;
+            let size = [reader.options.height, reader.options.width];
+            Some(count_for_bytes((codec, *bytes), &contexts, size, &options.encode.model_path))
+        }
+        (stored_tokens, _) => stored_tokens,
+    };
     let encode_options = EncodeOptions { stored_tokens, ..options.encode.clone() };
     let mut encoded = encode(model, reader, index, &encode_options)?;
     let stored = write(&coder, &mut encoded, options, (model, reader, index))?;
-    let scene = &encoded.scene;
-    let num_frames = reader.source.num_frames(index)?;
-    let held_out = match options.encode.hold_out {
+    let EncodedScene { scene, context, .. } = &encoded;
+    let is_context = |frame: &usize| context.frame_index.contains(frame);
+    let held_out: Vec<usize> = match options.encode.hold_out {
         0 => Vec::new(),
-        every => reader.source.held_out(index, every)?,
+        every => reader.source.held_out(index, every)?.into_iter().filter(|frame| !is_context(frame)).collect(),
     };
-    let is_context = |frame: &usize| scene.context_frames.contains(&(*frame as u32));
-    let held_out: Vec<usize> = held_out.into_iter().filter(|frame| !is_context(frame)).collect();
+    let others = match held_out[..] {
+        [] => read_others(reader, index, scene, 1)?,
+        _ => Some(reader.read_views(index, &held_out, &scene.world)?),
+    };
+    let mut renderer = scene_renderer(model, scene)?;
+    let contexts = CheckedView::contexts(&mut renderer, context)?;
+    let others = others.map_or(Ok(Vec::new()), |others| CheckedView::others(&mut renderer, &others, context))?;
     let image_size = reader.source.image_size(index, scene.context_frames[0] as usize)?;
     Ok(WrittenScene {
         stored,
         file_bytes: std::fs::metadata(&options.out).map_or(0, |file| file.len()),
         frame_names,
-        num_frames,
+        num_frames: reader.source.num_frames(index)?,
         image_size,
         cropped: cropped(image_size, [scene.width, scene.height]),
-        contexts: CheckedView::contexts(model, (reader, index), scene)?,
-        others: CheckedView::other_frames(model, (reader, index), scene, &held_out)?,
+        contexts,
+        others,
         encoded,
     })
 }
@@ -115,7 +124,7 @@ fn write(
             (codec, expected_step(scene, codec, *loss)?, format!("expected loss {loss} dB"))
         }
         Coder::Measured(codec, loss) => {
-            let (step, loss) = step_for_loss(model, reader, index, (scene, codec), *loss)?;
+            let (step, loss) = step_for_loss(model, reader, index, (scene, &encoded.context), codec, *loss)?;
             (codec, step, format!("measured loss {loss:.3} dB"))
         }
         Coder::Bytes(codec, bytes) => {

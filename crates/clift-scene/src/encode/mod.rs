@@ -2,7 +2,7 @@
 //!
 //! - `names`: scenes by key, frames by position or file name
 //! - `options`: the settings
-//! - `contexts`: the context views, by default groups of neighbours (`groups`), and their directions
+//! - `contexts`: the context views, by default groups of neighbours (`groups`)
 //! - `encode`: tokens, clusters, condenser
 //! - `cluster_map`: the clusters for a JSON file
 //! - `coding`: how the file stores the tokens

@@ -8,10 +8,10 @@ use clift_model::{Grouping, KMeans, ModelConfig, TokenCount};
 pub struct EncodeOptions {
     /// Context views and their groups.
     pub context: ContextChoice,
-    /// One of this many frames is not a context view, 0 for none.
+    /// One frame of this many is held out: it is not a context view. 0 for none.
     pub hold_out: usize,
-    /// Number of stored tokens of all groups; `None` for a quarter, down to an eighth
-    /// of many groups, or for all tokens of a network without clusters.
+    /// Number of stored tokens of all groups; `None` for a quarter (of many groups down to an eighth), or for all tokens of a
+    /// network without clusters.
     pub stored_tokens: Option<TokenCount>,
     /// Token groups that the model was trained on.
     pub grouping: Grouping,
@@ -52,12 +52,12 @@ pub enum ContextChoice {
         /// Number of views with the frame.
         num_views: usize,
     },
-    /// All frames, of a long path 128, in overlapping groups of neighbours.
+    /// All frames, or 128 along a longer path, in overlapping groups of neighbours.
     Neighbours {
         /// Views of a group.
         num_views: usize,
-        /// Number of groups, of which few leave views out; `None` for three for every four views, and more where these leave a
-        /// view out, but for no more than one for every 32 of a number of stored tokens.
+        /// Number of groups; few groups leave views out. `None`: three groups for every four views, and more if these leave a
+        /// view out; fewer if a number of stored tokens is less than 32 a group.
         num_groups: Option<usize>,
     },
 }

@@ -1,9 +1,11 @@
 //! The step of a scene's coefficients: the largest of a loss, measured on renderings of the scene, or the smallest of a size.
 
+use clift_core::ClipViews;
 use clift_data::ClipReader;
 use clift_model::{ModelError, TrainedModel};
 
-use crate::check::view_check::{CheckViews, render_scene};
+use crate::check::baselines::view_image;
+use crate::check::view_check::{read_others, render_views, scene_renderer};
 use crate::codec::token_codec::TokenCodec;
 use crate::error::SceneError;
 use crate::fit::fit::{loss, view_errors};
@@ -18,30 +20,30 @@ const MAX_FACTOR: f64 = 16.0;
 /// Halvings of the whole range of steps, for a size.
 const SIZE_SEARCH: usize = 32;
 
-/// Finds the largest step at which renderings of a scene lose at most `loss_db`. `scene` has tokens that are not rounded, and
-/// was encoded by `model` from scene `index` of `reader`; its loss is measured on frames that are not context views, or on the
-/// contexts where there is no other frame. Returns the step and its loss in dB.
+/// Finds the largest step at which renderings of a scene lose at most `loss_db`. `scene` has tokens that are not rounded, and was
+/// encoded by `model` from scene `index` of `reader`; its loss is measured on frames that are not context views, or on the
+/// `context` views where there is no other frame. Returns the step and its loss in dB.
 ///
 /// # Errors
-/// [`SceneError::NoScenes`] if no frame is readable, and the errors of the model.
+/// The errors of reading the frames, and of the model.
 pub fn step_for_loss(
     model: &TrainedModel,
     reader: &ClipReader,
     index: usize,
-    (scene, codec): (&Scene, &TokenCodec),
+    (scene, context): (&Scene, &ClipViews),
+    codec: &TokenCodec,
     loss_db: f64,
 ) -> Result<(f32, f64), SceneError> {
-    let views = CheckViews::read(reader, index, scene, MAX_FRAMES)?;
-    let views = match views {
-        Some(views) => views,
-        None => CheckViews::contexts(reader, index, scene)?,
-    };
-    let exact: Vec<f32> = render_scene(model, scene, &views.cameras, views.size)?.concat();
-    let errors = view_errors(&exact, &views.truth, views.truth.len() / views.cameras.len());
+    let others = read_others(reader, index, scene, MAX_FRAMES)?;
+    let views = others.as_ref().unwrap_or(context);
+    let truth: Vec<f32> = (0..views.num_views()).flat_map(|view| view_image(views, view)).collect();
+    let rendered =
+        |scene: &Scene| Ok::<_, SceneError>(render_views(&mut scene_renderer(model, scene)?, views)?.concat());
+    let exact = rendered(scene)?;
+    let errors = view_errors(&exact, &truth, truth.len() / views.num_views());
     let measured = |step: f32| -> Result<f64, SceneError> {
         let rounded = Scene { tokens: scene.rounded_tokens(codec, step)?, ..scene.clone() };
-        let rounded = render_scene(model, &rounded, &views.cameras, views.size)?.concat();
-        Ok(loss(&exact, &rounded, &errors))
+        Ok(loss(&exact, &rendered(&rounded)?, &errors))
     };
     let expected = codec.rates.step_for_loss(share(scene)?, loss_db);
     let (mut low, mut high) = (expected / MAX_FACTOR, expected * MAX_FACTOR);

@@ -125,7 +125,8 @@ impl RunScenes {
             stored_tokens: Some(TokenCount::Count(stored)),
             ..self.options.clone()
         };
-        let EncodedScene { mut scene, clusters, .. } = encode(&self.model, &self.reader, *index, &options)?;
+        let EncodedScene { mut scene, context: images, clusters, .. } =
+            encode(&self.model, &self.reader, *index, &options)?;
         scene.tokens = RUN_FORMAT.round(&scene.tokens, scene.model.dim)?;
         // The key comes from data: as a file name it must not lead to another folder.
         let file = format!("{}.clift", file_name(&scene.key));
@@ -142,7 +143,7 @@ impl RunScenes {
             index: request.scene,
             coding: RUN_FORMAT.into(),
             file_bytes: scene.file_bytes(RUN_FORMAT),
-            context_images: Some(true_frames::read_context(&self.reader, *index, &scene)?),
+            context_images: Some(true_frames::images(&images)?),
             clusters: Some(clusters.assignment().to_vec()),
             frames: true_frames::list(&self.reader, *index, &scene)?,
             storage_counts: counts,

@@ -1,7 +1,7 @@
 //! Frames of a run's scene that have a true image and are not context views.
 
 use clift_core::{Camera, ClipViews, Pose};
-use clift_data::{ClipReader, ViewIndices};
+use clift_data::ClipReader;
 use clift_eval::Canvas;
 use clift_scene::Scene;
 
@@ -36,20 +36,12 @@ pub fn list(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Vec<True
 
 /// Reads a frame at the size of the context views.
 pub fn read(reader: &ClipReader, index: usize, scene: &Scene, frame: TrueFrame) -> Result<TrueImage, ViewError> {
-    let context = scene.context_frames.iter().map(|&frame| frame as usize).collect();
-    let mut target = reader.read(index, &ViewIndices { context, target: vec![frame.frame] })?.target;
-    // The pose of the scene file: `reader` may normalize by the target too.
-    target.cameras[0].c2w = frame.c2w;
-    Ok(TrueImage { image: images(&target)?.remove(0), camera: target.cameras[0] })
+    let views = reader.read_views(index, &[frame.frame], &scene.world)?;
+    Ok(TrueImage { image: images(&views)?.remove(0), camera: views.cameras[0] })
 }
 
-/// Reads the context images.
-pub fn read_context(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Vec<Canvas>, ViewError> {
-    let context = scene.context_frames.iter().map(|&frame| frame as usize).collect();
-    images(&reader.read(index, &ViewIndices { context, target: Vec::new() })?.context)
-}
-
-fn images(views: &ClipViews) -> Result<Vec<Canvas>, ViewError> {
+/// Returns the images of views.
+pub fn images(views: &ClipViews) -> Result<Vec<Canvas>, ViewError> {
     let images = views.images.chunks_exact(views.height * views.width * 3);
     images.map(|rgb| Ok(Canvas::from_rgb8(rgb, views.height, views.width)?)).collect()
 }

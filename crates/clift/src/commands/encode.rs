@@ -51,15 +51,15 @@ pub struct EncodeArgs {
     /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. Numbers alone are positions, unless one begins with a zero:
     /// `0005` is a name. By default, a DIR of the command line is encoded in groups of neighbours, as many views each as in
     /// training, that together contain every photo (up to 128); a view is rendered from the groups nearest to it. A scene of
-    /// the run's data, or of a network without camera-relative attention, has one group along the camera path.
+    /// the run's data, or of a network with learned tokens, has one group along the camera path.
     #[arg(long, value_name = "FRAMES", value_delimiter = ',', conflicts_with_all = ["near", "groups"])]
     pub context: Vec<String>,
     /// Encode this frame and those nearest to it, as one group
     #[arg(long, value_name = "FRAME", conflicts_with = "groups")]
     pub near: Option<String>,
-    /// Number of groups of neighbours [default: 3 for every 4 photos, with 32 tokens each]
+    /// Number of groups of neighbours [default: 3 for every 4 photos]
     ///
-    /// Few groups leave photos out.
+    /// Few groups leave photos out. The default falls where a number of --stored-tokens is less than 32 a group.
     #[arg(long, value_name = "COUNT")]
     pub groups: Option<usize>,
     /// Leave one of N photos out, and compare it with its rendering
@@ -67,7 +67,7 @@ pub struct EncodeArgs {
     pub hold_out: usize,
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
     ///
-    /// Of a place with many groups the default falls to 1/8, for a file of at most about 400 kB.
+    /// With many groups the default falls to 1/8.
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
     /// Format of the tokens: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]

@@ -6,12 +6,12 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use clift_cube::{Buffer, Matrices, Values};
 
-/// Whether the kernels accept the tensor; f64 and f16 take the composed operations.
+/// Returns whether the kernels accept the tensor: f64 and f16 take the composed operations.
 pub(crate) fn is_native(x: &CubeTensor) -> bool {
     x.dtype == DType::F32 && x.qparams.is_none()
 }
 
-/// Returns the values of a tensor, one after the other.
+/// Returns the values of a tensor in row-major order, copied if they lie otherwise.
 pub(crate) fn buffer(x: CubeTensor) -> Buffer {
     let x = into_contiguous(x);
     Buffer { len: x.shape().num_elements(), handle: x.handle, values: Values::F32 }
@@ -31,7 +31,7 @@ pub(crate) struct MatrixBuffer {
 }
 
 impl MatrixBuffer {
-    /// Reads a tensor where it lies if its rows, or its columns, are whole; copies another.
+    /// Reads a tensor in place if its rows or its columns are contiguous, and a contiguous copy otherwise.
     pub(crate) fn new(x: CubeTensor) -> Self {
         Self::in_place(&x).unwrap_or_else(|| {
             let contiguous = into_contiguous(x);

@@ -4,7 +4,7 @@
 
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
+use crate::buffers::buffer::{Buffer, Values};
 
 const UNITS: usize = 64;
 
@@ -40,7 +40,7 @@ struct Groups {
     first: Buffer,
 }
 
-/// Sorts the members of a scene by segment, by counting those before them.
+/// Sorts the members of a scene by segment: counts the members before each.
 #[cube(launch_unchecked)]
 fn group(segment: &[i32], order: &mut [u32], first: &mut [u32], batch: usize, num_segments: usize, num_members: usize) {
     let index = ABSOLUTE_POS;
@@ -51,18 +51,18 @@ fn group(segment: &[i32], order: &mut [u32], first: &mut [u32], batch: usize, nu
         let start = scene * num_members;
         let mut count = 0u32;
         if unit < num_members {
-            let own = segment[start + unit];
+            let cluster = segment[start + unit];
             for i in 0..num_members {
                 let other = segment[start + i];
-                if other < own || (other == own && i < unit) {
+                if other < cluster || (other == cluster && i < unit) {
                     count += 1;
                 }
             }
             order[start + count as usize] = (start + unit) as u32;
         } else {
-            let own = (scene * num_segments + unit - num_members) as i32;
+            let cluster = (scene * num_segments + unit - num_members) as i32;
             for i in 0..num_members {
-                if segment[start + i] < own {
+                if segment[start + i] < cluster {
                     count += 1;
                 }
             }
@@ -111,7 +111,7 @@ fn dot<V: Size>(a: &Array<Vector<f32, V>>, b: &[Vector<f32, V>], start: usize, #
     for i in 0..vectors {
         sum = fma(a[i], b[start + i], sum);
     }
-    crate::reduce::sum_of_vector(sum)
+    crate::buffers::reduce::sum_of_vector(sum)
 }
 
 #[cube(launch_unchecked)]

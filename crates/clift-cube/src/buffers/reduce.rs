@@ -2,7 +2,7 @@
 
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
+use crate::buffers::buffer::{Buffer, Values};
 
 /// Returns the sum of a value over the `lanes` units of a row; all units of the cube call it together.
 #[cube]
@@ -30,7 +30,7 @@ pub(crate) fn sum_of_vector<V: Size>(vector: Vector<f32, V>) -> f32 {
 }
 
 /// Rows that a unit adds.
-pub(crate) const CHUNK: usize = 64;
+const CHUNK: usize = 64;
 const UNITS: usize = 64;
 
 /// Values that are summed over rows.

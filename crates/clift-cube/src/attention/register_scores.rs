@@ -3,9 +3,9 @@
 
 use cubecl::prelude::*;
 
-use crate::head_rows::{Head, Rows, write_values};
-use crate::load::{Four, load_four};
-use crate::register_product::{fetch, put};
+use crate::attention::head_rows::{Head, Rows, write_values};
+use crate::buffers::load::{Four, load_four};
+use crate::products::register_product::{fetch, put};
 
 /// Rows of a cube.
 pub(crate) const ROWS: usize = 64;
@@ -177,7 +177,7 @@ pub(crate) fn clear(array: &mut Array<Four<f32>>) {
     }
 }
 
-/// Returns whether a block's column of the unit is below the limit.
+/// Returns the unit's column `j` of the block that begins at `first`.
 #[cube]
 pub(crate) fn column_of(first: usize, j: usize) -> usize {
     first + UNIT_POS as usize % UNITS_X * 4 + j

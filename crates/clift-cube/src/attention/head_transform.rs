@@ -3,23 +3,23 @@
 
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
-use crate::elementwise::UNITS;
+use crate::buffers::buffer::{Buffer, Values};
+use crate::buffers::elementwise::{UNITS, cube_count};
 
-/// How a part of a row is transformed. The transform of a token is block-diagonal: on the first half of a head a 4 x 4 matrix,
-/// on the second half rotations.
+/// Transform of a part of a row. The transform of a token is block-diagonal: a 4 x 4 matrix on the first half of a head,
+/// rotations on the second half.
 #[derive(Clone, Copy, Debug)]
 pub struct PartTransform {
-    /// Whether the matrix is the inverse one.
+    /// Uses the inverse matrix.
     pub inverse: bool,
-    /// Whether the matrix is transposed.
+    /// Transposes the matrix.
     pub transposed: bool,
-    /// Whether the angles are negative.
+    /// Negates the angles.
     pub negative: bool,
 }
 
-/// Transforms the vector `k` of a head, and two pairs of its second half. Bit `part` of `inverse`, `transposed` and `negative`
-/// belongs to a part.
+/// Transforms vector `k` of a head's first half and two pairs of its second half. Bit `part` of `inverse`, `transposed` and
+/// `negative` is the flag of that part.
 #[cube(launch_unchecked)]
 fn transform(
     x: &[f32],
@@ -64,8 +64,8 @@ fn transform(
     }
 }
 
-/// Transforms `x: [tokens, parts, heads, E]` by `transforms: [tokens, 32 + E / 2]`, a matrix, its inverse, and cosine and sine of
-/// `E / 4` angles a token. E is a multiple of eight.
+/// Transforms `x: [tokens, parts, heads, E]` by `transforms: [tokens, 32 + E / 2]`: per token a matrix, its inverse, and the
+/// cosines and sines of `E / 4` angles. E is a multiple of eight.
 pub fn transform_heads(
     client: &Client,
     parts: &[PartTransform],
@@ -74,16 +74,14 @@ pub fn transform_heads(
     x: &Buffer,
 ) -> Buffer {
     let output = Buffer::empty(client, x.len, Values::F32);
-    let bits = |of: fn(&PartTransform) -> bool| {
-        parts.iter().enumerate().map(|(i, part)| usize::from(of(part)) << i).sum::<usize>()
+    let bits = |flag: fn(&PartTransform) -> bool| {
+        parts.iter().enumerate().map(|(i, part)| usize::from(flag(part)) << i).sum::<usize>()
     };
-    let cubes = (x.len / 8).div_ceil(UNITS);
-    let columns = cubes.clamp(1, 1 << 15);
     // SAFETY: the kernel compares its index with the length.
     unsafe {
         transform::launch_unchecked(
             client,
-            CubeCount::Static(columns as u32, cubes.div_ceil(columns) as u32, 1),
+            cube_count((x.len / 8).div_ceil(UNITS)),
             CubeDim::new_1d(UNITS as u32),
             x.arg(1),
             transforms.arg(1),

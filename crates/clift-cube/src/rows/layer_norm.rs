@@ -3,8 +3,9 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
-use crate::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
+use crate::buffers::buffer::{Buffer, Values};
+use crate::buffers::elementwise::cube_count;
+use crate::buffers::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
 
 /// Units of a row, and rows of a cube.
 const LANES: usize = 32;
@@ -27,7 +28,10 @@ fn forward<O: Float, V: Size>(
     let vectors = columns / V::value().comptime();
     let lane = UNIT_POS as usize % LANES;
     // Units beyond the last row compute that row too.
-    let row = min(CUBE_POS_X as usize * ROWS + UNIT_POS as usize / LANES, rows - 1);
+    let row = min(
+        (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * ROWS + UNIT_POS as usize / LANES,
+        rows - 1,
+    );
     let start = row * vectors;
 
     let mut sum = Vector::<f32, V>::new(0.0);
@@ -72,7 +76,10 @@ fn backward<V: Size>(
     let mut stage = Shared::<[f32]>::new_slice(ROWS * LANES);
     let vectors = columns / V::value().comptime();
     let lane = UNIT_POS as usize % LANES;
-    let row = min(CUBE_POS_X as usize * ROWS + UNIT_POS as usize / LANES, rows - 1);
+    let row = min(
+        (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * ROWS + UNIT_POS as usize / LANES,
+        rows - 1,
+    );
     let start = row * vectors;
     let mean = Vector::<f32, V>::new(statistics[row * 2]);
     let inverse = Vector::<f32, V>::new(statistics[row * 2 + 1]);
@@ -117,7 +124,7 @@ pub fn layer_norm_forward(
     unsafe {
         forward::launch_unchecked(
             client,
-            CubeCount::Static(rows.div_ceil(ROWS) as u32, 1, 1),
+            cube_count(rows.div_ceil(ROWS)),
             CubeDim::new_1d((ROWS * LANES) as u32),
             vector,
             x.arg(vector),
@@ -144,7 +151,7 @@ pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3]
     unsafe {
         backward::launch_unchecked(
             client,
-            CubeCount::Static(rows.div_ceil(ROWS) as u32, 1, 1),
+            cube_count(rows.div_ceil(ROWS)),
             CubeDim::new_1d((ROWS * LANES) as u32),
             vector,
             x.arg(vector),
@@ -165,7 +172,7 @@ pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3]
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reduce::sum_rows;
+    use crate::buffers::reduce::sum_rows;
     use crate::testing::{client, random, read, upload, worst};
 
     #[test]

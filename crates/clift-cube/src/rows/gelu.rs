@@ -3,8 +3,8 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
-use crate::elementwise::{UNITS, elementwise};
+use crate::buffers::buffer::{Buffer, Values};
+use crate::buffers::elementwise::{UNITS, elementwise};
 
 /// Returns `exp(-x^2 / 2)`.
 #[cube]

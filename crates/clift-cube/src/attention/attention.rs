@@ -1,15 +1,15 @@
-//! Attention of heads, forward and backward, in time and memory without score matrices.
+//! Attention of heads, forward and backward, without score matrices in global memory.
 
 use cubecl::prelude::*;
 
 use crate::adapter::AdapterClass;
-use crate::buffer::{Buffer, Values};
-use crate::elementwise::cast;
-use crate::head_rows::RowsLaunch;
-use crate::matrix_attention as matrix;
-use crate::matrix_scores::AttentionTile;
-use crate::register_attention as register;
-use crate::register_scores::{ROWS, UNITS};
+use crate::attention::head_rows::RowsLaunch;
+use crate::attention::matrix_attention as matrix;
+use crate::attention::matrix_scores::AttentionTile;
+use crate::attention::register_attention as register;
+use crate::attention::register_scores::{ROWS, UNITS};
+use crate::buffers::buffer::{Buffer, Values};
+use crate::buffers::elementwise::cast;
 
 /// Sizes of an attention.
 #[derive(Clone, Copy, Debug)]
@@ -28,7 +28,7 @@ pub struct AttentionSizes {
     pub operands: Values,
 }
 
-/// Rows with the heads of a token, from column `column` of `stride` columns; the rows of a scene follow those of another.
+/// Rows of a buffer, one a token, with its heads from column `column` of `stride` columns; scene after scene.
 #[derive(Clone, Debug)]
 pub struct HeadRows<'a> {
     /// The values.
@@ -55,7 +55,7 @@ impl<'a> AttentionInputs<'a> {
         [self.query.buffer, self.key.buffer, self.value.buffer]
     }
 
-    /// Returns the inputs with other buffers, or the same.
+    /// Returns the inputs, with `buffers` in place of their own if given.
     fn with<'b>(&self, buffers: Option<&'b [Buffer; 3]>) -> AttentionInputs<'b>
     where
         'a: 'b,
@@ -82,7 +82,7 @@ impl AttentionSizes {
         CubeCount::Static(count.div_ceil(rows) as u32, (self.batch * self.num_heads) as u32, 1)
     }
 
-    /// Returns the width of the vectors of which heads and rows are made.
+    /// Returns the width of vectors, 4 if it divides heads and rows, and 1 otherwise.
     fn vector(self, rows: &[&HeadRows]) -> usize {
         let aligned = |x: usize| x.is_multiple_of(4);
         let all = rows.iter().all(|rows| aligned(rows.column) && aligned(rows.stride) && aligned(rows.buffer.len));
@@ -94,7 +94,7 @@ fn rows(rows: &HeadRows, count: usize) -> RowsLaunch {
     RowsLaunch::new(rows.column, rows.stride, count)
 }
 
-/// Launches a kernel of cooperative matrices with a tile, and of register tiles without.
+/// Launches a kernel on cooperative matrices if a tile is given, and on register tiles otherwise.
 macro_rules! launch {
     ($tile:expr, $kernel:ident, $client:expr, $sizes:expr, $count:expr, $vector:expr, [$($argument:expr),+], $elem:expr) => {
         if let Some(tile) = $tile {

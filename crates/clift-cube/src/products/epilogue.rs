@@ -1,9 +1,9 @@
-//! What a product does with its sums before it writes them.
+//! Epilogue of a product: steps between its sums and its output.
 
 use cubecl::prelude::*;
 
-use crate::gelu::gelu;
-use crate::load::Four;
+use crate::buffers::load::Four;
+use crate::rows::gelu::gelu;
 
 /// Steps after the sum, in their order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]

@@ -7,21 +7,13 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use half::f16;
 
-use crate::epilogue::write_four;
-use crate::load::{Four, Lines, load_four};
-use crate::product_kind::{ProductKind, Sizes};
+use crate::adapter::MatrixShape;
+use crate::buffers::load::{Four, Lines, load_four};
+use crate::products::epilogue::write_four;
+use crate::products::product_kind::{ProductKind, Sizes};
 
-/// Values between two lines of a stage beyond those of a line, so that the lines begin in different banks.
+/// Padding of the lines of a stage, in values, so that lines begin in different banks.
 pub(crate) const PAD: usize = 8;
-
-/// Shape of the cooperative matrices of an adapter: f16 operands, f32 sums.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct MatrixShape {
-    /// M, N, K.
-    pub sizes: [usize; 3],
-    /// Units of a plane.
-    pub plane: usize,
-}
 
 /// Tile of a cube and of a plane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -97,7 +89,7 @@ fn fetch_operand<E: Numeric, V: Size>(
     }
 }
 
-/// Writes what [`fetch_lines`] read into a stage.
+/// Writes the values that [`fetch_lines`] read into a stage.
 #[cube]
 pub(crate) fn put_lines(
     stage: &mut [Four<f16>],
@@ -117,11 +109,11 @@ pub(crate) fn put_lines(
     }
 }
 
-/// Operand of a product of matrices, and how it lies in a stage.
+/// Operand of a product of matrices, and its layout in a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct StagedMatrix {
     pub(crate) ident: MatrixIdent,
-    /// Whether a line has the terms of a sum.
+    /// A line has the terms of a sum.
     pub(crate) terms_inner: bool,
     /// Values between two lines.
     pub(crate) pitch: usize,

@@ -5,9 +5,10 @@ use cubecl::cmma::{self, Matrix, MatrixIdent, MatrixLayout};
 use cubecl::prelude::*;
 use half::f16;
 
-use crate::head_rows::{Head, Rows, write_values};
-use crate::load::{Four, load_four};
-use crate::matrix_product::{MatrixShape, PAD, StagedMatrix, load_matrix};
+use crate::adapter::MatrixShape;
+use crate::attention::head_rows::{Head, Rows, write_values};
+use crate::buffers::load::{Four, load_four};
+use crate::products::matrix_product::{PAD, StagedMatrix, load_matrix};
 
 /// Tile of a cube.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -211,7 +212,7 @@ pub(crate) fn column_of_unit(i: usize, #[comptime] tile: AttentionTile) -> usize
     (UNIT_POS as usize % comptime!(tile.lanes()) + i * comptime!(tile.lanes())) * 4
 }
 
-/// Returns 0 in place of the values of columns at and after the limit.
+/// Replaces the values of columns at and after the limit by 0.
 #[cube]
 pub(crate) fn mask(values: Four<f32>, column: usize, limit: usize) -> Four<f32> {
     let mut masked = values;
@@ -284,7 +285,7 @@ pub(crate) fn scale_sums(
     sync_plane();
 }
 
-/// Writes a value of every unit where the others of its plane read it.
+/// Writes the unit's value to shared memory for the other units of its plane.
 #[cube]
 pub(crate) fn share(stage: &mut [f32], value: f32) {
     sync_plane();

@@ -5,7 +5,7 @@ use cubecl::prelude::*;
 /// Four values.
 pub(crate) type Four<F> = Vector<F, Const<4>>;
 
-/// Where a batch's matrix lies in a buffer: `outer` lines of `inner` values side by side.
+/// Position of a batch's matrix in a buffer: lines of values side by side, `stride` apart.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 pub(crate) struct Lines {
     pub(crate) start: usize,

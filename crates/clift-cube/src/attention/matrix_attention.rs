@@ -1,22 +1,22 @@
 //! Attention on cooperative matrices: f16 operands, f32 sums.
 //!
-//! A plane has as many rows of one head, queries or, in the backward by keys, keys, as a matrix has, and keeps them in
-//! registers; the cube reads the others in blocks of columns. Scores pass through shared memory, where the plane that made
-//! them turns them into weights.
+//! A plane keeps the rows of one matrix in registers: queries of one head, or keys in the backward by keys. The cube reads the
+//! other side in blocks of columns. Scores pass through shared memory, where the plane that computed them turns them into
+//! weights.
 // E width of a head
 
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use half::f16;
 
-use crate::head_rows::{Rows, head_of_cube, read_rows};
-use crate::load::Four;
-use crate::matrix_scores::{
+use crate::attention::head_rows::{Rows, head_of_cube, read_rows};
+use crate::attention::matrix_scores::{
     AttentionTile, Scores, Stage, add_products, column_of_unit, load_rows, mask, max_of_plane, max_of_row, row_of_unit,
     scale_sums, stage_block, sum_of_row, write_scores, write_sums, zero_sums,
 };
+use crate::buffers::load::Four;
 
-/// How far scores may exceed the maximum by which weights are divided: weights are at most `exp(LEEWAY)`.
+/// Largest excess of a score over the maximum that is subtracted from it: weights are at most `exp(LEEWAY)`.
 const LEEWAY: f32 = 8.0;
 
 /// Computes the output and the log sums `[batch, heads, queries]`.

@@ -1,16 +1,17 @@
 //! Attention on register tiles in f32: scores stay in registers and shared memory.
 //!
-//! A cube has 64 rows of one head, queries or, in the backward by keys, keys, and reads the others in blocks of 32 columns.
+//! A cube has 64 rows of one head, queries, or keys in the backward by keys, and reads the other side in blocks of 32 columns.
 //! A unit has 4 x 4 scores and, of its 4 rows, some columns of the sums.
+
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::head_rows::{Rows, head_of_cube, read_rows};
-use crate::load::Four;
-use crate::register_scores::{
+use crate::attention::head_rows::{Rows, head_of_cube, read_rows};
+use crate::attention::register_scores::{
     COLUMN_PITCH, COLUMNS, ROW_PITCH, ROWS, SLICE, UNITS_X, add_lines, add_scores, clear, column_of, stage_lines,
     sum_fours, write_sums,
 };
+use crate::buffers::load::Four;
 
 /// Computes the output and the log sums `[batch, heads, queries]`.
 #[cube(launch_unchecked)]

@@ -2,8 +2,9 @@
 
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
-use crate::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
+use crate::buffers::buffer::{Buffer, Values};
+use crate::buffers::elementwise::cube_count;
+use crate::buffers::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
 
 /// Units of a head, and heads of a cube.
 const LANES: usize = 8;
@@ -94,13 +95,11 @@ fn launch(client: &Client, [x, gammas, grad]: [&Buffer; 3], heads: NormHeads, is
     let vector = if head_width.is_multiple_of(4) { 4 } else { 1 };
     let output = Buffer::empty(client, x.len, Values::F32);
     let inverses = Buffer::empty(client, if is_gradient { rows * norm_parts * num_heads } else { 1 }, Values::F32);
-    let cubes = (rows * num_parts * num_heads).div_ceil(HEADS);
-    let columns = cubes.min(1 << 15);
     // SAFETY: the kernel reads and writes inside the heads.
     unsafe {
         norm::launch_unchecked(
             client,
-            CubeCount::Static(columns as u32, cubes.div_ceil(columns.max(1)) as u32, 1),
+            cube_count((rows * num_parts * num_heads).div_ceil(HEADS)),
             CubeDim::new_1d((HEADS * LANES) as u32),
             vector,
             x.arg(vector),

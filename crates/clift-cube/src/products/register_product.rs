@@ -4,9 +4,9 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::epilogue::write_four;
-use crate::load::{Four, Lines, load_four};
-use crate::product_kind::{ProductKind, Sizes};
+use crate::buffers::load::{Four, Lines, load_four};
+use crate::products::epilogue::write_four;
+use crate::products::product_kind::{ProductKind, Sizes};
 
 /// Tile of a cube and of a unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -70,7 +70,7 @@ pub(crate) fn fetch<E: Numeric, V: Size>(
     }
 }
 
-/// Writes what [`fetch`] read into a stage `[terms][side]`.
+/// Writes the values that [`fetch`] read into a stage `[terms][side]`.
 #[cube]
 pub(crate) fn put(
     stage: &mut [Four<f32>],

@@ -1,8 +1,8 @@
-//! What kernels of products are launched with and compiled for.
+//! Launch arguments and compile-time parameters of the kernels of products.
 
 use cubecl::prelude::*;
 
-use crate::epilogue::Epilogue;
+use crate::products::epilogue::Epilogue;
 
 /// Sizes of a product, and of the splits of its sums.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
@@ -14,7 +14,7 @@ pub(crate) struct Sizes {
     pub(crate) split_terms: usize,
 }
 
-/// What a kernel is compiled for.
+/// Compile-time parameters of a kernel of products.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct ProductKind {
     pub(crate) lhs: OperandKind,
@@ -25,7 +25,7 @@ pub(crate) struct ProductKind {
 /// Layout of an operand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct OperandKind {
-    /// Whether the terms of a sum lie side by side.
+    /// The terms of a sum lie side by side.
     pub(crate) terms_inner: bool,
 }
 

@@ -54,7 +54,7 @@ impl Buffer {
 }
 
 /// Matrices in a buffer, one a batch: value `(row, column)` of matrix `b` is at
-/// `start + b * batch_stride + row * row_stride + column * column_stride`, and one of the last two strides is one.
+/// `start + b * batch_stride + row * stride + column`, of a transposed matrix at `.. + row + column * stride`.
 #[derive(Clone, Debug)]
 pub struct Matrices<'a> {
     /// The values.
@@ -65,7 +65,7 @@ pub struct Matrices<'a> {
     pub batch_stride: usize,
     /// Values between two rows, or two columns of a transposed matrix.
     pub stride: usize,
-    /// Whether the values of a column lie side by side, and not those of a row.
+    /// The values of a column, not of a row, lie side by side.
     pub transposed: bool,
 }
 
@@ -73,13 +73,6 @@ impl<'a> Matrices<'a> {
     /// Returns one matrix of `columns` columns, row after row.
     pub fn contiguous(buffer: &'a Buffer, columns: usize) -> Self {
         Self { buffer, start: 0, batch_stride: 0, stride: columns, transposed: false }
-    }
-
-    /// Returns the transposed matrices.
-    #[must_use]
-    pub fn transpose(mut self) -> Self {
-        self.transposed = !self.transposed;
-        self
     }
 
     /// Returns 4 if every group of four values, of a `rows x columns` matrix, that begins at a multiple of four is one

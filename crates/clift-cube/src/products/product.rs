@@ -4,15 +4,16 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::adapter::{AdapterClass, ProductTile};
-use crate::buffer::{Buffer, Matrices, Values};
-use crate::epilogue::{Epilogue, write_four};
-use crate::load::{Four, LinesLaunch};
-use crate::matrix_product::matrix_product;
-use crate::product_kind::{OperandKind, ProductKind, SizesLaunch};
-use crate::register_product::register_product;
+use crate::adapter::AdapterClass;
+use crate::buffers::buffer::{Buffer, Matrices, Values};
+use crate::buffers::load::{Four, LinesLaunch};
+use crate::products::epilogue::{Epilogue, write_four};
+use crate::products::matrix_product::matrix_product;
+use crate::products::product_kind::{OperandKind, ProductKind, SizesLaunch};
+use crate::products::register_product::register_product;
+use crate::products::tiles::ProductTile;
 
-/// Tiles of the output below which the sums are split, so that every processor of a large adapter has work.
+/// Tiles of the output below which long sums are split, so that more processors of the adapter have work; not tuned.
 const MIN_TILES: usize = 96;
 /// Fewest stages of a split.
 const MIN_STAGES: usize = 16;
@@ -28,11 +29,11 @@ pub struct Product<'a> {
     pub batch: usize,
     /// M, N and K.
     pub sizes: [usize; 3],
-    /// Type to which operands are rounded; sums are in f32.
+    /// Type to which operands are rounded, on adapters with cooperative matrices; sums are in f32.
     pub operands: Values,
     /// Added to every row of the sums: `[N]` in f32.
     pub bias: Option<&'a Buffer>,
-    /// Whether GELU is applied after the bias.
+    /// Applies GELU after the bias.
     pub gelu: bool,
     /// Added last, in f32, in the layout of the output.
     pub residual: Option<&'a Buffer>,
@@ -47,7 +48,7 @@ impl<'a> Product<'a> {
         Self { lhs, rhs, batch: 1, sizes, operands, bias: None, gelu: false, residual: None, output }
     }
 
-    /// Computes the product into a new buffer, with the tile that the table has for the adapter.
+    /// Computes the product into a new buffer, with the adapter's tile of the table.
     pub fn run(&self, client: &Client) -> Buffer {
         self.run_tile(client, AdapterClass::of(client).product_tile(self.operands, self.sizes))
     }

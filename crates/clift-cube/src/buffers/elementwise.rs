@@ -1,19 +1,23 @@
-//! Kernels with a unit a vector of values.
+//! Elementwise kernels: one unit per vector of values.
 
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::buffer::{Buffer, Values};
+use crate::buffers::buffer::{Buffer, Values};
 
 /// Units of a cube.
 pub(crate) const UNITS: usize = 256;
 
-/// Returns the width of vectors, and the cubes of a kernel with a unit a vector.
+/// Returns the width of vectors and the count of cubes of an elementwise kernel.
 pub(crate) fn elementwise(len: usize) -> (usize, CubeCount) {
     let vector = if len.is_multiple_of(4) { 4 } else { 1 };
-    let cubes = (len / vector).div_ceil(UNITS);
+    (vector, cube_count((len / vector).div_ceil(UNITS)))
+}
+
+/// Returns a count of at least `cubes` cubes in two dimensions, each within the limit of adapters (65,535).
+pub(crate) fn cube_count(cubes: usize) -> CubeCount {
     let columns = cubes.min(1 << 15);
-    (vector, CubeCount::Static(columns as u32, cubes.div_ceil(columns.max(1)) as u32, 1))
+    CubeCount::Static(columns as u32, cubes.div_ceil(columns.max(1)) as u32, 1)
 }
 
 #[cube(launch_unchecked)]
@@ -27,7 +31,7 @@ fn copy<X: Float, O: Float, V: Size>(
     }
 }
 
-/// Returns the values in a type: the buffer itself if it has the type.
+/// Converts values to a type; a buffer of that type is returned as it is.
 pub fn cast(client: &Client, x: &Buffer, values: Values) -> Buffer {
     if x.values == values {
         return x.clone();

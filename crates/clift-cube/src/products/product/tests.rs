@@ -1,10 +1,9 @@
 use super::*;
-use crate::matrix_product::MatrixTile;
-use crate::register_product::RegisterTile;
-use crate::testing::{client, erfc, matrices, matrix_client, random, read, rounded, upload};
+use crate::products::matrix_product::MatrixTile;
+use crate::products::register_product::RegisterTile;
+use crate::testing::{client, erfc, matrix_client, random, read, rounded, upload};
 
 fn gelu(x: f64) -> f64 {
-    // Phi by its series around 0 and the continued fraction of its tail.
     0.5 * x * erfc(-x * std::f64::consts::FRAC_1_SQRT_2)
 }
 
@@ -105,7 +104,7 @@ fn products_are_equal_at_every_run() {
     let Some(client) = client() else { return };
     let (lhs, rhs) =
         (upload(&client, &random(70 * 600, 1), Values::F32), upload(&client, &random(600 * 33, 2), Values::F32));
-    let mut product = Product::new(matrices(&lhs, 600), matrices(&rhs, 33), [70, 33, 600]);
+    let mut product = Product::new(Matrices::contiguous(&lhs, 600), Matrices::contiguous(&rhs, 33), [70, 33, 600]);
     for operands in [Values::F32, Values::F16] {
         product.operands = operands;
         let first = read(&client, &product.run(&client));

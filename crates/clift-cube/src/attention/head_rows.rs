@@ -2,7 +2,7 @@
 
 use cubecl::prelude::*;
 
-use crate::load::Four;
+use crate::buffers::load::Four;
 
 /// The rows of a buffer.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
