@@ -25,7 +25,11 @@ fn a_killed_rank_ends_the_others_within_seconds() {
     let ran = finish(child);
     assert!(killed.elapsed() < Duration::from_secs(10), "{:?}", killed.elapsed());
     assert!(ran.code != Some(0) && ran.stderr.contains("signal 9 (Killed)"), "{}", ran.stderr);
-    assert!(ids.iter().all(|id| !is_running(*id)), "no rank is left");
+    // The launcher may end before the last rank is gone.
+    while ids.iter().any(|id| is_running(*id)) {
+        assert!(killed.elapsed() < Duration::from_secs(10), "no rank is left");
+        std::thread::sleep(Duration::from_millis(10));
+    }
 }
 
 #[test]

@@ -58,7 +58,13 @@ pub fn encode(
     options: &EncodeOptions,
 ) -> Result<EncodedScene, SceneError> {
     let (key, data) = (reader.source.key(scene), &reader.options);
-    let Contexts { frames, groups, normalization } = Contexts::choose(reader, scene, options)?;
+    let mut contexts = Contexts::choose(reader, scene, options)?;
+    let num_tokens = model.config.num_tokens(contexts.num_members(), data.height, data.width)?;
+    if options.stored_tokens.is_some_and(|count| count.of(num_tokens).is_err()) {
+        // The groups are few because the tokens are, and small groups do not have so many.
+        contexts = Contexts::choose(reader, scene, &EncodeOptions { stored_tokens: None, ..options.clone() })?;
+    }
+    let Contexts { frames, groups, normalization } = contexts;
     let context = reader.read_views(scene, &frames, &normalization)?;
     let sizes: Vec<usize> = groups.iter().map(|group| group.views.len()).collect();
     let counts = token_counts(model, [data.height, data.width], &sizes, options.stored_tokens)?;
