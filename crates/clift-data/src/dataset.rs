@@ -120,13 +120,40 @@ pub fn half_size_reader(config: &DataConfig, reader: &ClipReader) -> Result<Clip
     let SyntheticConfig { width, height, .. } = config.synthetic;
     let is_even = width.is_multiple_of(2) && height.is_multiple_of(2);
     if config.source == SourceKind::Synthetic && is_even && width * config.height == height * config.width {
-        let half = config.at_half_resolution();
-        let drawn = SyntheticSource::new(SyntheticConfig { split: Split::Train, ..half.synthetic.clone() })?;
-        let source = SceneSubset::first(Arc::new(drawn), reader.source.num_scenes());
-        return Ok(ClipReader { source: Arc::new(source), options: half.clip_options() });
+        return drawn_reader(&config.at_half_resolution(), reader.source.num_scenes());
     }
     let options = ClipOptions { half_size: true, ..reader.options };
     Ok(ClipReader { source: reader.source.clone(), options })
+}
+
+/// Returns a reader of the same training clips as `reader`, of the data set of `config`, with images of another size, and the
+/// config with this size.
+///
+/// Synthetic scenes that need no crop are drawn at that size, with the same field of view along the longer side.
+///
+/// # Errors
+/// [`DataError::BadConfig`] for a size that synthetic scenes cannot have.
+pub fn resized_reader(
+    config: &DataConfig,
+    reader: &ClipReader,
+    [width, height]: [usize; 2],
+) -> Result<(DataConfig, ClipReader), DataError> {
+    let mut resized = DataConfig { width, height, ..config.clone() };
+    let drawn = &mut resized.synthetic;
+    if config.source == SourceKind::Synthetic && [drawn.width, drawn.height] == [config.width, config.height] {
+        [drawn.width, drawn.height] = [width, height];
+        let reader = drawn_reader(&resized, reader.source.num_scenes())?;
+        return Ok((resized, reader));
+    }
+    let reader = ClipReader { source: reader.source.clone(), options: resized.clip_options() };
+    Ok((resized, reader))
+}
+
+/// Returns a reader of the first `num_scenes` synthetic training scenes.
+fn drawn_reader(config: &DataConfig, num_scenes: usize) -> Result<ClipReader, DataError> {
+    let drawn = SyntheticSource::new(SyntheticConfig { split: Split::Train, ..config.synthetic.clone() })?;
+    let source = Arc::new(SceneSubset::first(Arc::new(drawn), num_scenes));
+    Ok(ClipReader { source, options: config.clip_options() })
 }
 
 #[cfg(test)]
@@ -134,6 +161,7 @@ mod tests {
     use super::*;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::view_sampler::ViewSampler;
+    use crate::synthetic::config::Look;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
     use crate::testing::rooms;
     use clift_core::item_rng;
@@ -163,6 +191,32 @@ mod tests {
         data.synthetic.height = 36;
         let (read_half, reduced) = read(&data);
         assert_eq!(read_half, reduced);
+    }
+
+    #[test]
+    fn resized_synthetic_clips_are_drawn_or_cropped() {
+        let views = ViewIndices { context: vec![0, 7], target: vec![3] };
+        for drawn in [[32, 32], [40, 40]] {
+            let mut data = DataConfig { width: 32, height: 32, ..DataConfig::default() };
+            let scene = &mut data.synthetic;
+            (scene.num_scenes, scene.num_frames, [scene.width, scene.height]) = (2, 8, drawn);
+            scene.look = Look::Real;
+            let source = open_dataset(&data, Split::Train, &mut |_, _| ()).unwrap().source;
+            let reader = ClipReader { source, options: data.clip_options() };
+            let whole = reader.read(1, &views).unwrap().target.cameras[0];
+            for size in [[40, 24], [24, 40]] {
+                let (resized, reader) = resized_reader(&data, &reader, size).unwrap();
+                assert_eq!([resized.width, resized.height], size);
+                let target = reader.read(1, &views).unwrap().target;
+                assert_eq!([target.width, target.height], size);
+                let (camera, longer) = (target.cameras[0], 40.0 / 32.0);
+                assert_eq!(camera.c2w, whole.c2w);
+                // Drawn frames have the field of view along the longer side, cropped ones are resized to it.
+                let expected = whole.intrinsics.fx * longer;
+                assert!((camera.intrinsics.fx - expected).abs() < 1e-4 * expected, "{camera:?}");
+                assert!((camera.intrinsics.fx / camera.intrinsics.fy - 1.0).abs() < 1e-4, "{camera:?}");
+            }
+        }
     }
 
     #[test]

@@ -34,7 +34,7 @@ mod torch;
 
 // Opening a data set.
 pub use config::DataConfig;
-pub use dataset::{half_size_reader, open_dataset, open_training_dataset};
+pub use dataset::{half_size_reader, open_dataset, open_training_dataset, resized_reader};
 pub use error::{DataError, WorkerPanic};
 pub use scene_source::{SceneSource, Split, is_held_out};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};

@@ -84,7 +84,7 @@ pub use tokens::selection::rules::{SelectionPreset, SelectionRules};
 pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 // Networks
-pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
+pub use network::architecture::{Architecture, CameraEncoding, CliftVariant, RayFrame};
 pub use network::camera_encoding::TokenTransforms;
 pub use network::config::{CondenserConfig, ModelConfig};
 pub use network::init::Init;

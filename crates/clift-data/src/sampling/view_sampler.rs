@@ -43,6 +43,9 @@ pub struct ViewSampler {
     pub max_gap: [usize; 2],
     /// Steps of the warm-up of both gaps; 0 disables the warm-up.
     pub warm_up_steps: u64,
+    /// Whether items of few contexts have shorter gaps: divided by `max_context / num_context`, rounded down, as in
+    /// `DepthSplat`.
+    pub shorten_gaps: bool,
     /// Number of target views of an item.
     pub num_targets: usize,
     /// Whether targets may repeat. A target may also be a context frame in both cases.
@@ -59,6 +62,7 @@ impl Default for ViewSampler {
             min_gap: [25, 45],
             max_gap: [45, 135],
             warm_up_steps: 30_000,
+            shorten_gaps: true,
             num_targets: 6,
             with_replacement: true,
             inner: InnerViews::Random,
@@ -110,7 +114,7 @@ impl ViewSampler {
 
     /// Returns the smallest and the largest gap at `step` of a batch with `num_context` contexts.
     ///
-    /// Both are divided by `max_context / num_context`, rounded down.
+    /// With `shorten_gaps` both are divided by `max_context / num_context`, rounded down.
     pub fn gap_bounds(&self, step: u64, num_context: usize) -> [usize; 2] {
         [self.min_gap, self.max_gap]
             .map(|[init, last]| linear_warm_up(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
@@ -179,7 +183,7 @@ impl ViewSampler {
     }
 
     fn gap_divisor(&self, num_context: usize) -> usize {
-        (self.max_context / num_context.max(1)).max(1)
+        if self.shorten_gaps { (self.max_context / num_context.max(1)).max(1) } else { 1 }
     }
 }
 

@@ -28,6 +28,8 @@ pub enum Look {
     Rooms,
     /// Scenes with the statistics of photos: interiors, places outdoors, things; fields of view from 40 to 100 degrees.
     Real,
+    /// Those of `real`, but every eighth scene is one of `rooms`.
+    Mixed,
 }
 
 /// Options of synthetic scenes. Lengths are in units of the scene; a default room is 3 to 4 units wide.
@@ -35,7 +37,7 @@ pub enum Look {
 #[serde(deny_unknown_fields, default)]
 pub struct SyntheticConfig {
     /// Kind of scenes: `"rooms"`, or `"real"`, which has the statistics of photos and samples all that the keys from
-    /// `fov_deg` on set for rooms.
+    /// `fov_deg` on set for rooms, or `"mixed"`: every eighth scene is one of `rooms`, the others are of `real`.
     pub look: Look,
     /// Seed of all scenes. Different seeds share no scene.
     pub seed: u64,

@@ -21,8 +21,11 @@ const KEYS_PER_BLOCK: usize = 1024;
 /// Number of scenes kept for their further frames: more than threads read clips at once.
 const KEPT_SCENES: usize = 16;
 
+/// One scene in so many is a room for `look = "mixed"`.
+const ROOM_EVERY: usize = 8;
+
 /// A source of synthetic scenes, rendered on demand. Keys are `synthetic-<seed>-<split>-<index>`, and
-/// `synthetic-real-<seed>-<split>-<index>` for `look = "real"`.
+/// `synthetic-real-<seed>-<split>-<index>` for `look = "real"`, likewise for `"mixed"`.
 #[derive(Debug)]
 pub struct SyntheticSource {
     config: SyntheticConfig,
@@ -51,7 +54,11 @@ impl SyntheticSource {
 
     fn key_prefix(&self) -> String {
         let SyntheticConfig { look, seed, split, .. } = self.config;
-        let kind = if look == Look::Real { "real-" } else { "" };
+        let kind = match look {
+            Look::Rooms => "",
+            Look::Real => "real-",
+            Look::Mixed => "mixed-",
+        };
         format!("synthetic-{kind}{seed}-{split}-")
     }
 
@@ -74,16 +81,22 @@ impl SyntheticSource {
     }
 
     fn sample(&self, scene: usize) -> Scene {
-        let purpose = match (self.config.look, self.config.split) {
-            (Look::Rooms, Split::Train) => "synthetic train scene",
-            (Look::Rooms, Split::Test) => "synthetic test scene",
-            (Look::Real, Split::Train) => "synthetic real train scene",
-            (Look::Real, Split::Test) => "synthetic real test scene",
+        let is_room = match self.config.look {
+            Look::Rooms => true,
+            Look::Real => false,
+            Look::Mixed => scene.is_multiple_of(ROOM_EVERY),
+        };
+        let purpose = match (is_room, self.config.split) {
+            (true, Split::Train) => "synthetic train scene",
+            (true, Split::Test) => "synthetic test scene",
+            (false, Split::Train) => "synthetic real train scene",
+            (false, Split::Test) => "synthetic real test scene",
         };
         let mut rng = step_rng(self.config.seed, scene as u64, purpose);
-        match self.config.look {
-            Look::Rooms => Scene::Room(Box::new(Room::sample(&mut rng, &self.config))),
-            Look::Real => Scene::Real(Box::new(RealScene::sample(rng))),
+        if is_room {
+            Scene::Room(Box::new(Room::sample(&mut rng, &self.config)))
+        } else {
+            Scene::Real(Box::new(RealScene::sample(rng)))
         }
     }
 
@@ -239,6 +252,16 @@ mod tests {
             for other in &seen[i + 1..] {
                 assert!(matches!(other, Scene::Real(other) if other.shares_nothing_with(real)));
             }
+        }
+    }
+
+    #[test]
+    fn mixed_scenes_are_those_of_both_looks() {
+        let of = |look| source(|c| (c.look, c.num_scenes) = (look, 20));
+        let [mixed, real, rooms] = [Look::Mixed, Look::Real, Look::Rooms].map(of);
+        for scene in 0..20 {
+            let expected = if scene % 8 == 0 { &rooms } else { &real };
+            assert_eq!(mixed.sample(scene), expected.sample(scene), "{scene}");
         }
     }
 

@@ -53,6 +53,8 @@ impl From<ModelSection> for ModelConfig {
             num_renderer_blocks: section.num_renderer_blocks.unwrap_or(defaults.num_renderer_blocks),
             patch_size: section.patch_size.unwrap_or(defaults.patch_size),
             camera_encoding: section.camera_encoding,
+            rays: section.rays,
+            group_size: section.group_size,
             patch_grids: section.patch_grids,
             condenser: CondenserConfig {
                 num_blocks: section.condenser.num_blocks.unwrap_or(defaults.condenser.num_blocks),

@@ -5,7 +5,7 @@ use std::fmt::Display;
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
-use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant};
+use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant, RayFrame};
 use crate::views::patch_grids::PatchGrids;
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are those of the network's paper, with six blocks each
@@ -34,6 +34,12 @@ pub struct ModelConfig {
     /// How attention knows the cameras: `plucker` (by the rays of the input alone), `gta` (by poses too) or `prope` (by poses and
     /// intrinsics too).
     pub camera_encoding: CameraEncoding,
+    /// Frame of the rays of the input: `world`, or `camera` with camera-relative attention, which makes the network independent
+    /// of the frame of the scene.
+    pub rays: RayFrame,
+    /// Most context views that the encoder reads together: more are divided, in their order, into the fewest equal groups. 0
+    /// reads all views together.
+    pub group_size: usize,
     /// Number of renderings, with patches shifted along the diagonal, whose mean is an image: 1, 2 or 4. Training renders an
     /// image once.
     pub patch_grids: PatchGrids,
@@ -66,6 +72,8 @@ pub(crate) const SIZES: ModelConfig = ModelConfig {
     num_renderer_blocks: 6,
     patch_size: 8,
     camera_encoding: CameraEncoding::Plucker,
+    rays: RayFrame::World,
+    group_size: 0,
     patch_grids: PatchGrids::One,
     condenser: CondenserConfig::NONE,
 };
@@ -100,6 +108,8 @@ pub(crate) struct ModelSection {
     pub num_renderer_blocks: Option<usize>,
     pub patch_size: Option<usize>,
     pub camera_encoding: CameraEncoding,
+    pub rays: RayFrame,
+    pub group_size: usize,
     pub patch_grids: PatchGrids,
     pub condenser: CondenserSection,
 }
@@ -114,14 +124,15 @@ pub(crate) struct CondenserSection {
 }
 
 impl ModelConfig {
-    /// Returns the values of one context patch: RGB and six ray coordinates per pixel (576 for 8 x 8).
+    /// Returns the values of one context patch: RGB and the coordinates of the ray per pixel (576 for 8 x 8 in the world
+    /// frame).
     pub fn context_patch_len(&self) -> usize {
-        self.patch_size * self.patch_size * 9
+        self.rgb_patch_len() + self.ray_patch_len()
     }
 
-    /// Returns the values of one target patch: six ray coordinates per pixel (384 for 8 x 8).
+    /// Returns the values of one target patch: the coordinates of the ray per pixel (384 for 8 x 8 in the world frame).
     pub fn ray_patch_len(&self) -> usize {
-        self.patch_size * self.patch_size * 6
+        self.patch_size * self.patch_size * self.rays.num_coordinates()
     }
 
     /// Returns the values of one rendered patch: RGB per pixel (192 for 8 x 8).
@@ -139,6 +150,13 @@ impl ModelConfig {
             return Err(ModelError::NotDivisible { width, height, patch_size });
         }
         Ok(num_views * (height / patch_size) * (width / patch_size))
+    }
+
+    /// Returns the number of groups of context views that the encoder reads one by one: the fewest equal groups of at most
+    /// `group_size` views. Views that do not divide so are one group.
+    pub fn num_groups(&self, num_views: usize) -> usize {
+        let is_small = |groups: &usize| num_views.is_multiple_of(*groups) && num_views / groups <= self.group_size;
+        (1..=num_views / 2).find(is_small).unwrap_or(1)
     }
 
     /// Returns the number of patches of every grid that an image of `width` by `height` pixels is the mean of.
@@ -177,6 +195,10 @@ impl ModelConfig {
         if self.camera_encoding != CameraEncoding::Plucker && !head_width.is_multiple_of(8) {
             let fix = format!("needs heads of a multiple of 8 channels, not {head_width}: change model.num_heads");
             return bad("model.camera_encoding", self.camera_encoding, fix);
+        }
+        if self.rays == RayFrame::Camera && self.camera_encoding == CameraEncoding::Plucker {
+            let fix = "needs camera-relative attention: write model.camera_encoding = \"gta\"".into();
+            return bad("model.rays", self.rays, fix);
         }
         if self.patch_grids != PatchGrids::One {
             let reason = match (self.camera_encoding, self.patch_size) {
@@ -306,6 +328,28 @@ mod tests {
         assert!(prope.starts_with("`model.patch_grids` = 4: model.camera_encoding = \"prope\""), "{prope}");
         let three = parse(&gta.replace('4', "3")).unwrap_err().to_string();
         assert!(three.contains("write 1, 2 or 4"), "{three}");
+    }
+
+    #[test]
+    fn many_views_are_encoded_in_the_fewest_equal_groups() {
+        let groups = |group_size, counts: &[usize]| {
+            let config = ModelConfig { group_size, ..ModelConfig::default() };
+            counts.iter().map(|&views| config.num_groups(views)).collect::<Vec<_>>()
+        };
+        assert_eq!(groups(0, &[0, 1, 4, 100]), [1; 4]);
+        assert_eq!(groups(4, &[1, 2, 4, 6, 8, 9, 10, 12]), [1, 1, 1, 2, 2, 3, 5, 3]);
+        assert_eq!(groups(4, &[5, 7, 11]), [1; 3], "a prime number is one group");
+    }
+
+    #[test]
+    fn rays_of_cameras_need_camera_relative_attention() {
+        let message = |text: &str| {
+            let config = serde_json::from_str::<ModelConfig>(text).expect("a model section");
+            config.validate().map(|()| config.context_patch_len()).map_err(|error| error.to_string())
+        };
+        let plucker = message(r#"{"rays": "camera"}"#).unwrap_err();
+        assert!(plucker.starts_with("`model.rays` = camera: needs camera-relative attention"), "{plucker}");
+        assert_eq!(message(r#"{"rays": "camera", "camera_encoding": "gta", "patch_size": 4}"#), Ok(96));
     }
 
     #[test]

@@ -45,18 +45,19 @@ pub(crate) trait Design {
 
 /// An encoder as a list of blocks on the residual stream.
 pub(crate) trait EncoderBlocks {
-    /// Makes the transforms of the tokens for camera-relative attention; `None` without it.
+    /// Makes the transforms of the tokens for camera-relative attention, one sequence per group of views; `None` without it.
     fn transforms(&self, _context: &Cameras) -> Option<TokenTransforms> {
         None
     }
 
-    /// Makes the input of the first block, `[batch, rows, dim]`.
+    /// Makes the input of the first block, `[batch * groups, rows, dim]`: one sequence per group of views that the encoder
+    /// reads together.
     fn embed(&self, context: &Views) -> Tensor<3>;
 
     /// Returns the number of blocks.
     fn num_blocks(&self) -> usize;
 
-    /// Applies a block; the last one returns the tokens, `[batch, num_tokens, dim]`.
+    /// Applies a block; the last one returns the tokens, `[batch * groups, num_tokens / groups, dim]`.
     fn block(&self, index: usize, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3>;
 }
 

@@ -7,7 +7,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
 use crate::error::ModelError;
-use crate::network::architecture::{CameraEncoding, CliftVariant};
+use crate::network::architecture::{CameraEncoding, CliftVariant, RayFrame};
 use crate::network::blocks::block::EncoderBlock;
 use crate::network::blocks::pixels::{decode_image, embed_context, embed_rays};
 use crate::network::camera_encoding::TokenTransforms;
@@ -35,6 +35,7 @@ impl Design for LvsmEd {
         check_count("model.num_encoder_blocks", config.num_encoder_blocks, 1 << 10)?;
         check_count("model.num_latents", config.num_latents, 1 << 16)?;
         check_absent("model.condenser.num_blocks", config.condenser.num_blocks, config)?;
+        check_absent("model.group_size", config.group_size, config)?;
         if config.camera_encoding != CameraEncoding::Plucker {
             let fix = format!("model.architecture = \"{}\" has \"plucker\": leave the key out", config.architecture);
             return bad("model.camera_encoding", config.camera_encoding, fix);
@@ -129,7 +130,7 @@ impl EncoderBlocks for LatentEncoder {
     fn embed(&self, context: &Views) -> Tensor<3> {
         let colors = context.images.clone();
         let colors = if self.has_signed_colors { colors * 2.0 - 1.0 } else { colors };
-        let patches = embed_context(&self.patch_embed, colors, &context.cameras, self.patch_size);
+        let patches = embed_context(&self.patch_embed, colors, &context.cameras, self.patch_size, RayFrame::World);
         let ([batch, ..], [_, count, dim]) = (patches.dims(), self.latents.weight.dims());
         Tensor::cat(vec![self.latents.weight.val().expand([batch, count, dim]), patches], 1) // [B, L + N, D]
     }
@@ -182,7 +183,7 @@ impl RendererBlocks for JointRenderer {
     }
 
     fn embed(&self, tokens: &KeyValueCache, targets: &Cameras) -> Tensor<3> {
-        self.joint.join(embed_rays(&self.ray_embed, targets, self.patches.size), tokens.sets())
+        self.joint.join(embed_rays(&self.ray_embed, targets, self.patches.size, RayFrame::World), tokens.sets())
     }
 
     fn num_blocks(&self) -> usize {

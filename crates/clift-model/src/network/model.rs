@@ -106,11 +106,16 @@ pub(crate) fn is_condenser(path: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use burn::tensor::DType;
+    use clift_core::{Camera, ClipViews, DMat3, Intrinsics, Pose};
+
     use super::*;
-    use crate::network::architecture::CliftVariant;
+    use crate::network::architecture::{CameraEncoding, CliftVariant, RayFrame};
+    use crate::network::pass::Pass;
     use crate::ops::precision::Precision;
     use crate::testing::{
-        Fixture, assert_close, devices, error_norms, gradient_pairs, load_weights, small_lvsm, weight_gradients,
+        Fixture, assert_close, devices, error_norms, gradient_pairs, load_weights, random, small_lvsm, to_vec,
+        weight_gradients,
     };
 
     fn small(config: ModelConfig) -> ModelConfig {
@@ -129,6 +134,77 @@ mod tests {
         assert_equals_pytorch("model", &small(ModelConfig::default()));
         assert_equals_pytorch("lvsm", &small(small_lvsm(CliftVariant::Paper)));
         assert_equals_pytorch("lvsm_stock", &small(small_lvsm(CliftVariant::ReleasedRe10k)));
+    }
+
+    /// Two scenes of four context views and a target view, on the flex device, in another frame with `turned`.
+    fn two_scenes(turned: bool) -> (Views, Cameras) {
+        let device = Device::flex();
+        let frame = Pose { rotation: DMat3::from_rotation_x(0.7), translation: [0.5, -2.0, 1.0].into() };
+        let camera = |index: usize| {
+            let shift = [0.3 * index as f64, 0.1, -0.2 * (index % 3) as f64];
+            let c2w = Pose { rotation: DMat3::from_rotation_y(0.2 * index as f64), translation: shift.into() };
+            let intrinsics = Intrinsics { fx: 20.0, fy: 21.0, cx: 8.5, cy: 7.5 };
+            Camera { c2w: if turned { frame.after(c2w) } else { c2w }, intrinsics }
+        };
+        let upload = |first: usize, count: usize| {
+            let views = |scene: usize| ClipViews {
+                width: 16,
+                height: 16,
+                images: Vec::new(),
+                cameras: (first..first + count).map(|view| camera(5 * scene + view)).collect(),
+                frame_index: (0..count).collect(),
+            };
+            Cameras::upload(&[&views(0), &views(1)], &device).expect("valid")
+        };
+        let images = random([2, 4, 16 * 16 * 3], 5, &device).reshape([2, 4, 16, 16, 3]).cast(DType::F32);
+        (Views { images, cameras: upload(0, 4) }, upload(4, 1))
+    }
+
+    fn gta(rays: RayFrame, group_size: usize) -> ModelConfig {
+        let sizes = small(ModelConfig { camera_encoding: CameraEncoding::Gta, rays, group_size, ..Default::default() });
+        ModelConfig { num_heads: 2, ..sizes }
+    }
+
+    #[test]
+    fn a_network_with_rays_of_cameras_depends_on_relative_poses_alone() {
+        let image = |rays: RayFrame, turned: bool| {
+            let model = Network::new(&gta(rays, 2), 3, &Device::flex());
+            let (context, targets) = two_scenes(turned);
+            to_vec(model.render(model.encode(&context), &targets))
+        };
+        let difference = |rays: RayFrame| {
+            let [a, b] = [false, true].map(|turned| image(rays, turned));
+            a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        assert!(difference(RayFrame::Camera) < 1e-5, "{}", difference(RayFrame::Camera));
+        assert!(difference(RayFrame::World) > 1e-3, "{}", difference(RayFrame::World));
+    }
+
+    #[test]
+    fn groups_are_encoded_one_by_one() {
+        let model = Network::new(&gta(RayFrame::World, 2), 3, &Device::flex());
+        let (context, targets) = two_scenes(false);
+        let tokens = model.encode(&context);
+        let group = |first: usize| {
+            let Views { images, cameras: Cameras { c2w, intrinsics, .. } } = context.clone();
+            let (c2w, intrinsics) = (c2w.narrow(1, first, 2), intrinsics.narrow(1, first, 2));
+            let images = images.narrow(1, first, 2);
+            model.encode(&Views { images, cameras: Cameras { c2w, intrinsics, ..context.cameras } })
+        };
+        let alone = [group(0), group(2)];
+        let values = Tensor::cat(alone.iter().map(|tokens| tokens.values.clone()).collect(), 1);
+        assert_close(&tokens.values, &values, 1e-6);
+        // The tokens keep their cameras: a rendering of the second group alone is that of its tokens in the scene.
+        let second: Vec<u32> = (8..16).collect();
+        let images = [model.render(alone[1].clone(), &targets), model.render(tokens.select(&second), &targets)];
+        assert_close(&images[0], &images[1], 1e-6);
+        let together = Network::new(&gta(RayFrame::World, 0), 3, &Device::flex()).encode(&context);
+        assert!(to_vec(together.values - values).iter().any(|difference| difference.abs() > 1e-3));
+        // The plain pass and the pass block by block agree.
+        let step = |_: &Network, tokens: Tokens| Ok::<RenderTokens, ()>(tokens.into());
+        let pass = Pass::new(&model, &context, &targets, &step);
+        let image = pass.to_image(pass.forward().expect("no error"));
+        assert_close(&image, &model.render(tokens, &targets), 1e-6);
     }
 
     /// Weights and outputs of one forward pass.

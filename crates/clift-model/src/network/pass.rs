@@ -71,6 +71,7 @@ impl<'a, E> Pass<'a, E> {
         }
         if index == select_at {
             let features = Tokens { values: take_x(), transforms: self.context_transforms.clone() };
+            let features = features.joined(context.cameras.dims()[0]);
             let tokens = (self.token_step)(model, model.normalize(features))?;
             return Ok(PassState { x: None, tokens: Some(model.renderer.accept(tokens)) });
         }

@@ -47,6 +47,19 @@ impl Tokens {
         Self { transforms: self.transforms.as_ref().map(|transforms| transforms.tracked_as(&values)), values }
     }
 
+    /// Joins the groups of every scene.
+    ///
+    /// # Shapes
+    /// - of `[batch * groups, count, dim]`; returns `[batch, groups * count, dim]`
+    #[must_use]
+    pub(crate) fn joined(self, batch: usize) -> Self {
+        let [groups, count, dim] = self.dims();
+        Self {
+            transforms: self.transforms.map(|transforms| transforms.regroup(batch)),
+            values: self.values.reshape([batch, groups * count / batch, dim]),
+        }
+    }
+
     /// Returns the values on the host, row-major.
     ///
     /// # Errors

@@ -1,9 +1,21 @@
-//! Plücker coordinates of every pixel's ray (paper section 3.1; moment first).
+//! The ray of every pixel: Plücker coordinates (paper section 3.1; moment first), or a direction.
 // B scenes, V views, H rows, W columns
 
 use burn::tensor::{Int, Tensor, assert_shape};
 
+use crate::network::architecture::RayFrame;
 use crate::views::upload::Cameras;
+
+/// Computes the ray of every pixel in the frame of the scene ([`plucker`]) or of its camera.
+///
+/// # Shapes
+/// - returns `[batch, views, height, width, 6]`, or 3 values in the frame of the camera
+pub fn rays(cameras: &Cameras, frame: RayFrame) -> Tensor<5> {
+    match frame {
+        RayFrame::World => plucker(cameras),
+        RayFrame::Camera => camera_rays(cameras),
+    }
+}
 
 /// Computes the ray of every pixel as `[moment, direction]`: `moment = origin x direction`, and the unit `direction` in
 /// the world frame through the center of the pixel, `(column + 0.5, row + 0.5)`.
@@ -11,6 +23,22 @@ use crate::views::upload::Cameras;
 /// # Shapes
 /// - returns `[batch, views, height, width, 6]`
 pub fn plucker(cameras: &Cameras) -> Tensor<5> {
+    let [batch, views] = cameras.dims();
+    let (height, width) = (cameras.height, cameras.width);
+    let camera_ray = camera_rays(cameras).reshape([batch, views, height * width, 3]);
+
+    let rotation = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 0..3]);
+    let direction = camera_ray.matmul(rotation.swap_dims(2, 3)).reshape([batch, views, height, width, 3]);
+    let origin = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 3..4]);
+    let origin = origin.reshape([batch, views, 1, 1, 3]).expand([batch, views, height, width, 3]);
+    Tensor::cat(vec![cross(origin, direction.clone()), direction], 4)
+}
+
+/// Computes the unit direction of every pixel's ray in the frame of its camera.
+///
+/// # Shapes
+/// - returns `[batch, views, height, width, 3]`
+fn camera_rays(cameras: &Cameras) -> Tensor<5> {
     let [batch, views] = cameras.dims();
     let (height, width) = (cameras.height, cameras.width);
     assert_shape!(cameras.intrinsics, [batch, views, 4]);
@@ -29,13 +57,7 @@ pub fn plucker(cameras: &Cameras) -> Tensor<5> {
     // The third coordinate is 1, so that the length is at least 1.
     let camera_ray = Tensor::cat(vec![x, y, z], 4);
     let length = camera_ray.clone().square().sum_dim(4).sqrt();
-    let camera_ray = (camera_ray / length).reshape([batch, views, height * width, 3]);
-
-    let rotation = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 0..3]);
-    let direction = camera_ray.matmul(rotation.swap_dims(2, 3)).reshape([batch, views, height, width, 3]);
-    let origin = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 3..4]);
-    let origin = origin.reshape([batch, views, 1, 1, 3]).expand([batch, views, height, width, 3]);
-    Tensor::cat(vec![cross(origin, direction.clone()), direction], 4)
+    camera_ray / length
 }
 
 /// Computes the cross product along the last dimension.
@@ -58,6 +80,12 @@ mod tests {
         let c2w = Pose { rotation: DMat3::from_rotation_y(0.3), translation: DVec3::new(0.5, -0.2, 0.1) };
         let camera = Camera { c2w, intrinsics: Intrinsics { fx: 20.0, fy: 22.0, cx: 8.5, cy: 4.0 } };
         let rays = to_vec(plucker(&Cameras::of_views(&[camera], 8, 16, &Device::flex()).expect("valid"))); // [1, 1, 8, 16, 6]
+        let cameras = Cameras::of_views(&[Camera { c2w: Pose::IDENTITY, ..camera }], 8, 16, &Device::flex());
+        let own = to_vec(camera_rays(&cameras.expect("valid")));
+        for (direction, ray) in own.chunks(3).zip(rays.chunks(6)) {
+            let turned = c2w.rotation * DVec3::from_slice(direction);
+            assert!((turned - DVec3::from_slice(&ray[3..])).abs().max_element() < 1e-6);
+        }
         for (i, ray) in rays.chunks(6).enumerate() {
             let direction = camera.direction((i % 16) as f64 + 0.5, (i / 16) as f64 + 0.5);
             let moment = c2w.translation.cross(direction);

@@ -23,7 +23,7 @@ pub fn weights_hash<M: Module>(module: &M) -> String {
 }
 
 /// Hashes a renderer's weights ([`weights_hash`]) together with variant, number of heads and camera encoding, which tensor
-/// shapes do not determine.
+/// shapes do not determine. They do determine the frame of the rays.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, camera_encoding, .. } = config;
     // The paper's encoding is not named: the hashes are part of scene files.

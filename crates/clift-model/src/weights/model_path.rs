@@ -114,6 +114,8 @@ pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
             ("model.num_heads", config.num_heads.to_string()),
             ("model.architecture", config.architecture.to_string()),
             ("model.camera_encoding", config.camera_encoding.to_string()),
+            ("model.rays", config.rays.to_string()),
+            ("model.group_size", config.group_size.to_string()),
             ("model.patch_size", config.patch_size.to_string()),
             ("model.dim", config.dim.to_string()),
             ("model.feed_forward_dim", config.feed_forward_dim.to_string()),

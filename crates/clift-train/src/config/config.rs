@@ -235,6 +235,9 @@ pub struct Stage1Config {
     /// Share of the updates, the first ones, whose images have half the width and height. They take a fraction of the time.
     /// Validation has whole images.
     pub half_resolution: f64,
+    /// Further sizes of the images, `[width, height]` in pixels, at most as many pixels as `data.width` x `data.height`; every
+    /// update has one of all sizes, drawn at random. Validation has `data.width` x `data.height`.
+    pub further_sizes: Vec<[usize; 2]>,
     /// Scenes per update.
     pub batch_size: usize,
     /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them.
@@ -252,6 +255,7 @@ impl Default for Stage1Config {
         Self {
             steps: 90_000,
             half_resolution: 0.0,
+            further_sizes: Vec::new(),
             batch_size: 64,
             accumulate: 1,
             keep_tokens: [0.25, 1.0],
@@ -369,6 +373,14 @@ mod tests {
             (
                 |c| (c.loss.perceptual_weight, c.data.width) = (0.5, 8),
                 "`loss.perceptual_weight` = 0.5: VGG-19 needs images of at least 16 x 16, not 8 x 256: write 0",
+            ),
+            (
+                |c| c.stage1.further_sizes = vec![[128, 100]],
+                "`stage1.further_sizes` = [128, 100]: write multiples of model.patch_size = 8",
+            ),
+            (
+                |c| c.stage1.further_sizes = vec![[512, 256]],
+                "`stage1.further_sizes` = [512, 256]: write a size of at most 65536 pixels, as data.width x data.height",
             ),
             (|c| c.stage1.half_resolution = 600.0, "`stage1.half_resolution` = 600: write 0 to 1"),
             (

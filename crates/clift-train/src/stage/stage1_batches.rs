@@ -1,7 +1,7 @@
 //! Batches of stage 1: clips with random subsets of the tokens.
 
-use clift_core::{ClipViews, derive_seed, item_rng, step_rng};
-use clift_data::{ClipReader, TrainingClips, half_size_reader};
+use clift_core::{ClipViews, derive_seed, item_rng, step_rng, uniform_below};
+use clift_data::{ClipReader, DataConfig, DataError, TrainingClips, half_size_reader, resized_reader};
 use rand::RngExt;
 use rand::seq::index::sample;
 
@@ -13,12 +13,18 @@ use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Maker of the batches of stage 1, a pure function of (seed, step).
 pub struct Stage1Batches {
-    clips: TrainingClips,
-    /// Clips of the steps with half the resolution, where there are such steps.
-    half_resolution_clips: Option<TrainingClips>,
+    /// Clips of every image size.
+    sizes: Vec<SizedClips>,
     config: Config,
     parts: BatchParts,
     seed: u64,
+}
+
+/// Clips of one image size.
+struct SizedClips {
+    whole: TrainingClips,
+    /// Clips of the steps with half the resolution, where there are such steps.
+    half: Option<TrainingClips>,
 }
 
 impl Stage1Batches {
@@ -31,17 +37,24 @@ impl Stage1Batches {
             clips.map(|clips| clips.with_flip(data.flip))
         };
         let has_half = config.stage(Stage::Stage1).half_resolution_steps > 0;
-        let half = has_half.then(|| clips(half_size_reader(data, reader)?)).transpose()?;
-        Ok(Self { clips: clips(reader.clone())?, half_resolution_clips: half, config: config.clone(), parts, seed })
+        let sized = |(data, reader): (DataConfig, ClipReader)| {
+            let half = has_half.then(|| clips(half_size_reader(&data, &reader)?)).transpose()?;
+            Ok(SizedClips { whole: clips(reader)?, half })
+        };
+        let further = stage1.further_sizes.iter().map(|&size| resized_reader(data, reader, size));
+        let readers = std::iter::once(Ok((data.clone(), reader.clone()))).chain(further);
+        let sizes = readers.map(|reader| sized(reader?)).collect::<Result<_, DataError>>()?;
+        Ok(Self { sizes, config: config.clone(), parts, seed })
     }
 
     /// Makes the batch of `step`, counted from 0.
     ///
-    /// The share of tokens is sampled once per step; every target view gets its own random subset.
+    /// Image size and share of tokens are sampled once per step; every target view gets its own random subset.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let (mut clips, mut skipped) = (Vec::new(), Vec::new());
         let is_half = self.config.stage(Stage::Stage1).is_half_resolution(step + 1);
-        let source = self.half_resolution_clips.as_ref().filter(|_| is_half).unwrap_or(&self.clips);
+        let sized = &self.sizes[uniform_below(&mut step_rng(self.seed, step, "image size"), self.sizes.len())];
+        let source = sized.half.as_ref().filter(|_| is_half).unwrap_or(&sized.whole);
         for slot in self.parts.slots() {
             let mut of_slot = Vec::new();
             clips.push(source.slot(step, slot, &mut of_slot)?);

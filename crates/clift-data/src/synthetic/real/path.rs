@@ -183,7 +183,8 @@ impl Path {
         middle + Vec3::from(swing)
     }
 
-    /// Returns the camera of one frame, with square pixels and a principal point of its own.
+    /// Returns the camera of one frame, with square pixels, a principal point of its own, and the path's field of view along
+    /// the longer side.
     pub fn camera(&self, time: f32, aspect: f64, frame: usize) -> Camera<IntrinsicsNorm> {
         let position = self.position(time);
         let [mut yaw, mut pitch, roll] = self.shake.map(|wave| sway(wave, time));
@@ -202,7 +203,8 @@ impl Path {
         let [yaw, pitch, roll] = [(yaw, 0), (pitch, 1), (roll, 2)]
             .map(|(angle, part)| f64::from(angle + self.jitter * (2.0 * byte(noise, part) - 1.0)));
         let rotation = DMat3::from_rotation_y(yaw) * DMat3::from_rotation_x(-pitch) * DMat3::from_rotation_z(roll);
-        let fx = 0.5 / (0.5 * f64::from(self.fov_deg).to_radians()).tan();
+        let longer = 0.5 / (0.5 * f64::from(self.fov_deg).to_radians()).tan();
+        let fx = longer / aspect.min(1.0);
         let shift = hash(frame as i32, 1, self.seed);
         let [cx, cy] = [0, 1].map(|part| f64::from(0.5 + OFF_CENTER * (2.0 * byte(shift, part) - 1.0)));
         Camera {

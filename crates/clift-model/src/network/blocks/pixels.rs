@@ -5,9 +5,10 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
 
+use crate::network::architecture::RayFrame;
 use crate::ops::linear::{linear_in_f32, norm_linear};
 use crate::views::patch::{patchify, unpatchify};
-use crate::views::rays::plucker;
+use crate::views::rays::rays;
 use crate::views::upload::Cameras;
 
 /// Embeds colours and rays of context patches.
@@ -15,8 +16,14 @@ use crate::views::upload::Cameras;
 /// # Shapes
 /// - `colors`: `[batch, views, height, width, 3]`
 /// - returns `[batch, views * patches, dim]`
-pub fn embed_context(layer: &Linear, colors: Tensor<5>, cameras: &Cameras, patch_size: usize) -> Tensor<3> {
-    let pixels = Tensor::cat(vec![colors, plucker(cameras)], 4); // [B, V, H, W, 9]
+pub fn embed_context(
+    layer: &Linear,
+    colors: Tensor<5>,
+    cameras: &Cameras,
+    patch_size: usize,
+    frame: RayFrame,
+) -> Tensor<3> {
+    let pixels = Tensor::cat(vec![colors, rays(cameras, frame)], 4); // [B, V, H, W, 6 or 9]
     linear_in_f32(layer, patchify(pixels, patch_size))
 }
 
@@ -24,9 +31,9 @@ pub fn embed_context(layer: &Linear, colors: Tensor<5>, cameras: &Cameras, patch
 ///
 /// # Shapes
 /// - returns `[batch * views, num_queries, dim]`
-pub fn embed_rays(layer: &Linear, targets: &Cameras, patch_size: usize) -> Tensor<3> {
+pub fn embed_rays(layer: &Linear, targets: &Cameras, patch_size: usize, frame: RayFrame) -> Tensor<3> {
     let [batch, views] = targets.dims();
-    let rays = linear_in_f32(layer, patchify(plucker(targets), patch_size)); // [B, TQ, D]
+    let rays = linear_in_f32(layer, patchify(rays(targets, frame), patch_size)); // [B, TQ, D]
     let [_, queries, dim] = rays.dims();
     rays.reshape([batch * views, queries / views, dim])
 }

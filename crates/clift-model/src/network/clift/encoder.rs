@@ -18,7 +18,7 @@ pub struct PatchEncoder {
     patch_embed: Linear,
     blocks: Vec<EncoderBlock>,
     #[module(skip)]
-    patch_size: usize,
+    config: ModelConfig,
     #[module(skip)]
     transforms: TransformMaker,
 }
@@ -29,19 +29,28 @@ impl PatchEncoder {
         Self {
             patch_embed: init.linear(config.context_patch_len(), config.dim),
             blocks: (0..config.num_encoder_blocks).map(|_| EncoderBlock::new(config, init)).collect(),
-            patch_size: config.patch_size,
+            config: config.clone(),
             transforms: TransformMaker::new(config),
         }
+    }
+
+    /// Returns the number of groups of views of all scenes.
+    fn num_groups(&self, context: &Cameras) -> usize {
+        let [batch, views] = context.dims();
+        batch * self.config.num_groups(views)
     }
 }
 
 impl EncoderBlocks for PatchEncoder {
     fn transforms(&self, context: &Cameras) -> Option<TokenTransforms> {
-        self.transforms.of_views(context)
+        self.transforms.of_views(context).map(|transforms| transforms.regroup(self.num_groups(context)))
     }
 
     fn embed(&self, context: &Views) -> Tensor<3> {
-        embed_context(&self.patch_embed, context.images.clone(), &context.cameras, self.patch_size)
+        let Views { images, cameras } = context;
+        let x = embed_context(&self.patch_embed, images.clone(), cameras, self.config.patch_size, self.config.rays);
+        let ([batch, count, dim], groups) = (x.dims(), self.num_groups(cameras));
+        x.reshape([groups, batch * count / groups, dim])
     }
 
     fn num_blocks(&self) -> usize {

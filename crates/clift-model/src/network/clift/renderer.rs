@@ -6,6 +6,7 @@ use burn::tensor::Tensor;
 
 use crate::network::blocks::block::DecoderBlock;
 use crate::network::blocks::pixels::{decode_image, embed_rays};
+use crate::network::architecture::RayFrame;
 use crate::network::camera_encoding::{TokenTransforms, TransformMaker};
 use crate::network::config::ModelConfig;
 use crate::network::design::{Patches, RendererBlocks};
@@ -24,6 +25,8 @@ pub struct CrossRenderer {
     #[module(skip)]
     patches: Patches,
     #[module(skip)]
+    rays: RayFrame,
+    #[module(skip)]
     transforms: TransformMaker,
 }
 
@@ -36,6 +39,7 @@ impl CrossRenderer {
             output_norm: init.layer_norm(config.dim),
             to_pixels: init.linear(config.dim, config.rgb_patch_len()),
             patches: Patches::new(config),
+            rays: config.rays,
             transforms: TransformMaker::new(config),
         }
     }
@@ -66,7 +70,7 @@ impl RendererBlocks for CrossRenderer {
     }
 
     fn embed(&self, _tokens: &KeyValueCache, targets: &Cameras) -> Tensor<3> {
-        embed_rays(&self.ray_embed, targets, self.patches.size)
+        embed_rays(&self.ray_embed, targets, self.patches.size, self.rays)
     }
 
     fn num_blocks(&self) -> usize {

@@ -38,7 +38,8 @@ impl Encoder {
         let blocks = self.blocks();
         let transforms = blocks.transforms(&context.cameras);
         let forward = |x, index| blocks.block(index, x, transforms.as_ref());
-        Tokens { values: (0..blocks.num_blocks()).fold(blocks.embed(context), forward), transforms }
+        let values = (0..blocks.num_blocks()).fold(blocks.embed(context), forward);
+        Tokens { values, transforms }.joined(context.cameras.dims()[0])
     }
 
     pub(crate) fn blocks(&self) -> &dyn EncoderBlocks {
