@@ -159,6 +159,12 @@ impl ModelConfig {
         (1..=num_views / 2).find(is_small).unwrap_or(1)
     }
 
+    /// Whether a view can be rendered from the tokens of several groups: rays of cameras depend on no frame, so that all groups
+    /// share one.
+    pub fn joins_groups(&self) -> bool {
+        self.rays == RayFrame::Camera
+    }
+
     /// Returns the number of patches of every grid that an image of `width` by `height` pixels is the mean of.
     ///
     /// # Errors

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeSet;
 
-use clift_core::{Pose, PoseNormalization, ViewDistance};
+use clift_core::{Pose, PoseNormalization, ViewDistance, median};
 use clift_data::{ClipReader, DataError, contexts_along_path};
 use clift_model::{ModelError, TokenCount};
 
-use crate::encode::groups::{nearest_views, neighbour_groups};
+use crate::encode::groups::{nearest_views, neighbour_groups, neighbour_partition};
 use crate::encode::options::{ContextChoice, EncodeOptions};
 use crate::error::SceneError;
 use crate::scene::scene::ContextGroup;
@@ -47,13 +47,14 @@ impl Contexts {
             PoseNormalization::find(key, views, &[], data.pose_rotation, data.pose_scale).map_err(DataError::from)
         };
         let of_frames = |frames: &[usize]| frames.iter().map(|&frame| poses[frame]).collect::<Vec<_>>();
-        let ContextChoice::Neighbours { num_views, num_groups } = options.context else {
+        let ContextChoice::Neighbours { num_views, num_groups, joined } = options.context else {
             let normalization = find(&of_frames(&frames))?;
             return Ok(Self { groups: vec![ContextGroup::of_all(frames.len())], frames, normalization });
         };
-        let groups = match (num_groups, most_groups(options.stored_tokens, frames.len())) {
-            (Some(count), _) | (None, Some(count)) => neighbour_groups(&of_frames(&frames), num_views, count, false),
-            (None, None) => neighbour_groups(&of_frames(&frames), num_views, default_groups(frames.len()), true),
+        let groups = match num_groups.or(most_groups(options.stored_tokens, frames.len())) {
+            _ if joined => neighbour_partition(&of_frames(&frames), num_views),
+            Some(count) => neighbour_groups(&of_frames(&frames), num_views, count, false),
+            None => neighbour_groups(&of_frames(&frames), num_views, default_groups(frames.len()), true),
         };
         // The members of the groups alone are context views.
         let members: BTreeSet<usize> = groups.iter().flatten().copied().collect();
@@ -68,7 +69,18 @@ impl Contexts {
             let frame = find(&poses).unwrap_or(PoseNormalization { mean_c2w: poses[0], scale: 1.0 });
             ContextGroup { views, frame }
         });
-        Ok(Self { groups: groups.collect(), frames, normalization })
+        let contexts = Self { groups: groups.collect(), frames, normalization };
+        Ok(if joined { contexts.with_shared_frame() } else { contexts })
+    }
+
+    /// Gives all groups one frame, whose scale is the median of theirs.
+    fn with_shared_frame(mut self) -> Self {
+        let scales: Vec<f64> = self.groups.iter().map(|group| group.frame.scale).collect();
+        self.normalization.scale *= median(&scales);
+        for group in &mut self.groups {
+            group.frame = ContextGroup::of_all(0).frame;
+        }
+        self
     }
 
     /// Returns the number of members of all groups.
@@ -126,6 +138,9 @@ fn choose_frames(poses: &[Pose], choice: &ContextChoice, held_out: &[usize]) -> 
             nearest_views(&kept_poses, ViewDistance::new(&kept_poses), position, num_views)
         }
         ContextChoice::Spread(num_views) => spread(num_views)?,
+        ContextChoice::Neighbours { num_views, num_groups: Some(count), joined: true } => {
+            spread(MAX_VIEWS.min(num_views.saturating_mul(count)))?
+        }
         ContextChoice::Neighbours { .. } => spread(MAX_VIEWS)?,
     };
     Ok(positions.into_iter().map(|position| kept[position]).collect())
@@ -138,6 +153,16 @@ fn bad(key: &'static str, value: String, fix: String) -> SceneError {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn groups_with_a_shared_frame_have_the_median_scale() {
+        let frame = |scale: f64| PoseNormalization { mean_c2w: Pose::IDENTITY, scale };
+        let group = |scale: f64| ContextGroup { views: vec![0, 1], frame: frame(scale) };
+        let groups = vec![group(4.0), group(3.0), group(9.0)];
+        let contexts = Contexts { frames: vec![0, 1], groups, normalization: frame(0.5) }.with_shared_frame();
+        assert_eq!(contexts.normalization, frame(2.0));
+        assert!(contexts.groups.iter().all(|group| group.frame == frame(1.0)));
+    }
 
     #[test]
     fn few_tokens_have_few_groups() {
@@ -157,7 +182,7 @@ mod tests {
         assert_eq!(choose_frames(&poses[..3], &ContextChoice::Spread(4), &[]).unwrap(), [0, 1, 2]);
         assert_eq!(frames(ContextChoice::Frames(vec![7, 2])).unwrap(), [7, 2]);
         assert_eq!(frames(ContextChoice::Near { frame: 8, num_views: 3 }).unwrap(), [7, 8, 9]);
-        let all = ContextChoice::Neighbours { num_views: 4, num_groups: None };
+        let all = ContextChoice::Neighbours { num_views: 4, num_groups: None, joined: false };
         assert_eq!(frames(all).unwrap(), (0..10).collect::<Vec<_>>());
         assert_eq!(choose_frames(&poses, &ContextChoice::Spread(9), &[0, 4, 8]).unwrap(), [1, 2, 3, 5, 6, 7, 9]);
         let near = frames(ContextChoice::Near { frame: 12, num_views: 3 }).unwrap_err();

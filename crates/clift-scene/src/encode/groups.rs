@@ -1,5 +1,7 @@
 //! Groups of neighbouring views, each encoded as in training: views far apart, encoded together, come out as fog.
 
+use std::collections::BTreeSet;
+
 use clift_core::{Pose, ViewDistance};
 
 /// Chooses `num_groups` groups of `num_views` neighbours, in ascending order each. Groups overlap. If `all` views must be
@@ -34,6 +36,34 @@ pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usi
     groups
 }
 
+/// Divides views into groups of neighbours, as few as possible of at most `num_views` views each, of about equal sizes, in
+/// ascending order each.
+///
+/// The next group is that of the view farthest from its nearest others among the views left, so that none is left alone.
+pub(crate) fn neighbour_partition(views: &[Pose], num_views: usize) -> Vec<Vec<usize>> {
+    let distance = ViewDistance::new(views);
+    let mut left: Vec<usize> = (0..views.len()).collect();
+    let num_groups = views.len().div_ceil(num_views);
+    let mut groups = Vec::with_capacity(num_groups);
+    for group in 0..num_groups {
+        let size = left.len().div_ceil(num_groups - group);
+        let poses: Vec<Pose> = left.iter().map(|&view| views[view]).collect();
+        let width = |group: &Vec<usize>, seed: usize| -> f64 {
+            group.iter().map(|&view| distance.between(&poses[view], &poses[seed])).sum()
+        };
+        let of_seeds = (0..poses.len()).map(|seed| {
+            let group = nearest_views(&poses, distance, seed, size);
+            (width(&group, seed), group)
+        });
+        let Some((_, group)) = of_seeds.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
+        groups.push(group.iter().map(|&view| left[view]).collect::<Vec<_>>());
+        let taken = groups.last().into_iter().flatten().copied().collect::<BTreeSet<_>>();
+        left.retain(|view| !taken.contains(view));
+    }
+    groups.sort();
+    groups
+}
+
 /// Returns a view and the `num_views - 1` nearest others, in ascending order.
 pub(crate) fn nearest_views(views: &[Pose], distance: ViewDistance, seed: usize, num_views: usize) -> Vec<usize> {
     let mut others: Vec<usize> = (0..views.len()).filter(|&view| view != seed).collect();
@@ -53,6 +83,24 @@ mod tests {
 
     fn on_a_line(places: &[f64]) -> Vec<Pose> {
         places.iter().map(|&x| Pose { translation: x * DVec3::X, ..Pose::IDENTITY }).collect()
+    }
+
+    #[test]
+    fn a_partition_has_every_view_once_beside_its_neighbours() {
+        let groups = |places: &[f64], num_views| neighbour_partition(&on_a_line(places), num_views);
+        let steady: Vec<f64> = (0..10).map(f64::from).collect();
+        assert_eq!(groups(&steady, 4), [vec![0, 1, 2], vec![3, 4, 5], vec![6, 7, 8, 9]]);
+        assert_eq!(groups(&steady[..3], 4), [vec![0, 1, 2]]);
+        assert!(groups(&[], 4).is_empty());
+        // The two far views are served before the others choose.
+        assert_eq!(groups(&[5.0, 0.0, 5.1, 0.1, 5.2, 5.3, 0.2, 0.3], 4), [vec![0, 2, 4, 5], vec![1, 3, 6, 7]]);
+        for count in 1..40 {
+            let groups = groups(&(0..count).map(|i| f64::from(i * i % 17)).collect::<Vec<_>>(), 4);
+            let mut all: Vec<usize> = groups.iter().flatten().copied().collect();
+            all.sort_unstable();
+            assert_eq!(all, (0..count as usize).collect::<Vec<_>>());
+            assert!(groups.iter().all(|group| group.len() <= 4 && (count < 5 || group.len() > 1)), "{groups:?}");
+        }
     }
 
     #[test]

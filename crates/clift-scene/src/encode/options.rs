@@ -52,22 +52,26 @@ pub enum ContextChoice {
         /// Number of views with the frame.
         num_views: usize,
     },
-    /// All frames, or 128 along a longer path, in overlapping groups of neighbours.
+    /// All frames, or 128 along a longer path, in groups of neighbours.
     Neighbours {
         /// Views of a group.
         num_views: usize,
-        /// Number of groups; few groups leave views out. `None`: three groups for every four views, and more if these leave a
-        /// view out; fewer if a number of stored tokens is less than 32 a group.
+        /// Number of groups; few groups leave views out. `None`: of overlapping groups three for every four views, and more if
+        /// these leave a view out; fewer if a number of stored tokens is less than 32 a group.
         num_groups: Option<usize>,
+        /// Whether a view is rendered from the tokens of all groups ([`ModelConfig::joins_groups`]): the groups then share a
+        /// frame and do not overlap.
+        joined: bool,
     },
 }
 
 impl ContextChoice {
-    /// Returns the default for a captured scene and a network that was trained with up to `num_views` views: groups of
+    /// Returns the choice for a captured scene and a network that was trained with up to `num_views` views: groups of
     /// neighbours; of learned tokens, which have no place, views along the path.
-    pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
+    pub fn for_capture(model: &ModelConfig, num_views: usize, num_groups: Option<usize>) -> Self {
+        let num_views = if model.group_size > 0 { model.group_size } else { num_views };
         if model.has_patch_tokens() {
-            Self::Neighbours { num_views, num_groups: None }
+            Self::Neighbours { num_views, num_groups, joined: model.joins_groups() }
         } else {
             Self::Spread(num_views)
         }

@@ -32,6 +32,9 @@ use crate::scene::token_format::TokenFormat;
 /// Length of the header of a scene file in bytes.
 pub const HEADER_BYTES: usize = 2048;
 
+/// Most tokens of several groups that a view is rendered from: as many as those of the context views of a training scene.
+pub const MAX_JOINED_TOKENS: usize = 2048;
+
 pub(crate) const FORMAT: &str = "clift-scene";
 /// The version of files with plain tokens.
 pub(crate) const VERSION: &str = "6";
@@ -125,9 +128,21 @@ impl Scene {
         tokens
     }
 
-    /// Returns the largest number of tokens of a group, from which a view is rendered.
-    pub fn max_group_tokens(&self) -> usize {
-        self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default()
+    /// Returns the most tokens that a view is rendered from at once: those of the largest group, or, of a network that joins
+    /// groups, [`MAX_JOINED_TOKENS`].
+    pub fn max_render_tokens(&self) -> usize {
+        let largest = || self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default();
+        if self.model.joins_groups() { self.num_tokens().min(MAX_JOINED_TOKENS) } else { largest() }
+    }
+
+    /// Returns the groups whose tokens views are rendered from, with the positions of their tokens: one of all context views
+    /// for a network that joins groups.
+    pub(crate) fn render_groups(&self) -> Vec<(ContextGroup, Vec<u32>)> {
+        if !self.model.joins_groups() {
+            return self.groups.iter().cloned().zip(self.tokens_of_groups()).collect();
+        }
+        let views = self.groups.iter().flat_map(|group| group.views.clone()).collect();
+        vec![(ContextGroup { views, ..ContextGroup::of_all(0) }, (0..self.num_tokens() as u32).collect())]
     }
 
     /// Returns the ray of every token in the frame of its group, through the center of its patch; none of learned tokens.

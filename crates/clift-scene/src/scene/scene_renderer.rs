@@ -41,7 +41,7 @@ pub fn frame_bytes(scene: &Scene, model: &ModelConfig, [height, width]: [usize; 
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
     // Three values of four bytes per pixel of the frames, and of one while it is resampled.
     let pixels = ((frames_per_call(height, width) + 2) * height * width * 12) as u64;
-    render_bytes(model, scene.max_group_tokens(), num_images, num_images * largest) + pixels
+    render_bytes(model, scene.max_render_tokens(), num_images, num_images * largest) + pixels
 }
 
 /// Reads the renderer of a scene from a weight file.
@@ -78,12 +78,13 @@ pub struct SceneRenderer {
     renderer: Renderer,
     groups: Vec<TokenGroup>,
     distance: ViewDistance,
+    max_render_tokens: usize,
     /// Whether tokens have rays, by which a view selects them.
     has_patch_tokens: bool,
     device: Device,
 }
 
-/// The tokens of context views that were encoded together.
+/// The tokens of context views that views are rendered from together.
 #[derive(Clone, Debug)]
 struct TokenGroup {
     context: ContextGroup,
@@ -107,37 +108,38 @@ impl SceneRenderer {
         let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
         let mut groups = Vec::with_capacity(scene.groups.len());
         let mut first_patch = 0;
-        for (group, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
+        for (group, tokens) in scene.render_groups() {
             let rows = tokens.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
             let values = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, tokens.len(), dim]);
-            let context = scene.group_cameras(group);
+            let context = scene.group_cameras(&group);
             let cameras = Cameras::of_views(&context, scene.height, scene.width, device)?;
             let patches: Vec<u32> = tokens.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
             let values = Tensor::from_data(values, device);
             let rays: Vec<TokenRay> = tokens.iter().filter_map(|&token| rays.get(token as usize)).copied().collect();
+            first_patch += (group.views.len() * patches_per_view) as u32;
             groups.push(TokenGroup {
                 views: group.views.iter().map(|&view| scene.context[view as usize].c2w).collect(),
-                context: group.clone(),
+                context: group,
                 trained: TrainedImage::new(scene, &context),
                 cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
                 selector: Selector::new(rules, &rays)?,
                 tokens,
             });
-            first_patch += (group.views.len() * patches_per_view) as u32;
         }
         let context: Vec<Pose> = scene.context.iter().map(|camera| camera.c2w).collect();
         Ok(Self {
             renderer,
             groups,
             distance: ViewDistance::new(&context),
+            max_render_tokens: scene.max_render_tokens(),
             has_patch_tokens: scene.model.has_patch_tokens(),
             device: device.clone(),
         })
     }
 
-    /// Returns the most tokens that a frame is rendered from at once: those of the largest group.
+    /// Returns the most tokens that a frame is rendered from at once ([`Scene::max_render_tokens`]).
     pub fn max_render_tokens(&self) -> usize {
-        self.groups.iter().map(|group| group.tokens.len()).max().unwrap_or_default()
+        self.max_render_tokens
     }
 
     /// Returns the number of frames of `width` by `height` pixels that are rendered together.
@@ -163,6 +165,7 @@ impl SceneRenderer {
     /// Renders the next frames of a path from the groups of tokens nearest to each: of every group from the
     /// `num_render_tokens` tokens nearest to the view, or all its tokens if it has no more. A frame between groups is a mean
     /// of their images with weights that change continuously along a path; of `num_render_tokens`, each group has its share.
+    /// A network that [joins groups](ModelConfig::joins_groups) has one group of all tokens.
     /// Frames of all tokens are rendered [`Self::frames_per_call`] at a time. A frame of another size or field of view than
     /// the context views is resampled from images like theirs: it keeps the field of view of its camera, and a larger one has
     /// no more detail.
@@ -178,7 +181,8 @@ impl SceneRenderer {
         width: usize,
         num_render_tokens: usize,
     ) -> Result<Vec<RenderedView>, ModelError> {
-        let selects = num_render_tokens < self.max_render_tokens();
+        let num_render_tokens = num_render_tokens.min(self.max_render_tokens);
+        let selects = self.groups.iter().any(|group| num_render_tokens < group.tokens.len());
         if selects && !self.has_patch_tokens {
             let fix = format!(
                 "learned tokens belong to no view, so that none can be selected by the camera: render from all {}",
@@ -299,7 +303,7 @@ impl RenderedView {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::{CameraEncoding, Network, SelectionPreset, psnr, save_weights};
+    use clift_model::{CameraEncoding, Network, RayFrame, SelectionPreset, psnr, save_weights};
 
     use super::*;
     use crate::scene::scene::tests::{camera, scene, scene_of_groups};
@@ -413,6 +417,36 @@ mod tests {
                     whole.reset();
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_network_with_rays_of_cameras_renders_from_the_tokens_of_all_groups() {
+        let device = Device::flex();
+        let config = ModelConfig { rays: RayFrame::Camera, ..encoded(CameraEncoding::Gta) };
+        let renderer = Network::new(&config, 3, &device).renderer;
+        let mut scene = grouped_scene(&renderer, &config);
+        scene.groups.iter_mut().for_each(|group| group.frame = ContextGroup::of_all(0).frame);
+        let members: Vec<Camera> =
+            scene.groups.iter().flat_map(|group| &group.views).map(|&view| scene.context[view as usize]).collect();
+        let members = Cameras::of_views(&members, 16, 24, &device).unwrap();
+        let rules = SelectionPreset::Paper.rules();
+        let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
+        assert_eq!(whole.max_render_tokens(), 24);
+        for (count, view) in [(9, scene.context[1]), (24, scene.context[1]), (30, scene.context[0])] {
+            let got = whole.render(&[view], 16, 24, count).unwrap().remove(0);
+            let ids = got.tokens.unwrap_or_else(|| (0..24).collect());
+            assert_eq!(ids.len(), count.min(24));
+            assert!(ids.iter().any(|&id| id < 12) && ids.iter().any(|&id| id >= 12), "of both groups: {ids:?}");
+            let values = ids.iter().flat_map(|&id| &scene.tokens[id as usize * 16..][..16]).copied();
+            let values = TensorData::new(values.collect::<Vec<f32>>(), [1, ids.len(), 16]);
+            let tokens = Tokens::of_patches(&config, Tensor::from_data(values, &device), &members, &ids);
+            let cameras = Cameras::of_views(&[view], 16, 24, &device).unwrap();
+            let expected = renderer.forward(tokens, &cameras).into_data().convert::<f32>();
+            let pairs = got.pixels.iter().zip(expected.as_slice::<f32>().unwrap());
+            let error = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(error <= 1e-6, "{error} with {count} tokens");
+            whole.reset();
         }
     }
 

@@ -368,7 +368,7 @@ mod tests {
 
     #[test]
     fn invalid_values_are_named_with_the_fix() {
-        let cases: [(Change, &str); 6] = [
+        let cases: [(Change, &str); 8] = [
             (|c| c.loss.perceptual_weight = -0.5, "`loss.perceptual_weight` = -0.5: write 0 or a positive number"),
             (
                 |c| (c.loss.perceptual_weight, c.data.width) = (0.5, 8),

@@ -105,10 +105,7 @@ impl EncodeArgs {
             return Ok(ContextChoice::Near { frame, num_views });
         }
         if self.context.is_empty() {
-            return Ok(match self.groups {
-                None => model.context(),
-                num_groups => ContextChoice::Neighbours { num_views, num_groups },
-            });
+            return Ok(model.context(self.groups));
         }
         Ok(ContextChoice::Frames(frame_positions(&self.context, names)?))
     }

@@ -158,7 +158,7 @@ fn folder_items(
     let count = source.num_scenes().min(MAX_SCENES);
     let (mut items, mut skip_report) = (Vec::with_capacity(count), SkipReport::new(count));
     for scene in 0..count {
-        let context = model_args.context();
+        let context = model_args.context(None);
         match Contexts::choose(reader, scene, &EncodeOptions { context: context.clone(), ..EncodeOptions::default() }) {
             Ok(_) => items.push((scene, context)),
             Err(error) => skip_report.skip(source.key(scene), error.to_string()),

@@ -132,12 +132,13 @@ impl ModelArgs {
         Ok(())
     }
 
-    /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder.
-    pub fn context(&self) -> ContextChoice {
+    /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder. A
+    /// number of groups chooses groups in both cases.
+    pub fn context(&self, num_groups: Option<usize>) -> ContextChoice {
         let trained = self.config.data.views.max_context;
-        match self.folder {
-            None => ContextChoice::Spread(trained),
-            Some(_) => ContextChoice::for_capture(&self.config.model, trained),
+        match (&self.folder, num_groups) {
+            (None, None) => ContextChoice::Spread(trained),
+            _ => ContextChoice::for_capture(&self.config.model, trained, num_groups),
         }
     }
 
