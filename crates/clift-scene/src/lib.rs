@@ -27,6 +27,7 @@ pub use encode::encode::{EncodedScene, encode};
 pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
 pub use encode::names::{find_scene, frame_positions};
 pub use encode::options::{ContextChoice, EncodeOptions};
+pub use encode::photo_size::photo_size;
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::frame_size::check_frames;

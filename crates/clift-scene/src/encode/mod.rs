@@ -3,6 +3,7 @@
 //! - `names`: scenes by key, frames by position or file name
 //! - `options`: the settings
 //! - `contexts`: the context views, by default groups of neighbours (`groups`)
+//! - `photo_size`: the size at which a network sees whole photos
 //! - `encode`: tokens, clusters, condenser
 //! - `cluster_map`: the clusters for a JSON file
 //! - `coding`: how the file stores the tokens
@@ -16,3 +17,4 @@ pub(crate) mod encode_scene;
 pub(crate) mod groups;
 pub(crate) mod names;
 pub(crate) mod options;
+pub(crate) mod photo_size;

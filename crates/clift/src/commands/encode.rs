@@ -9,7 +9,7 @@ use clift_scene::{
     SceneOptions, TokenCoding, WrittenScene, check_output_path, encode_scene, find_scene, frame_positions,
 };
 
-use crate::commands::args::model_args::ModelArgs;
+use crate::commands::args::model_args::{ModelArgs, PhotoCrop};
 use crate::commands::args::parse::{parse_hold_out, parse_kb, parse_loss, parse_output, parse_split};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
@@ -57,6 +57,11 @@ pub struct EncodeArgs {
     /// Encode this frame and those nearest to it, as one group
     #[arg(long, value_name = "FRAME", conflicts_with = "groups")]
     pub near: Option<String>,
+    /// Part of each photo to encode: whole, or the middle with the proportions of the training images
+    ///
+    /// Networks trained with a single image size always have the middle.
+    #[arg(long, value_name = "PART", value_enum, default_value_t)]
+    pub crop: PhotoCrop,
     /// Number of groups of neighbours [default: 3 for every 4 photos]
     ///
     /// Few groups leave photos out. The default falls where a number of --stored-tokens is less than 32 a group.
@@ -139,7 +144,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         model_path: Scene::model_path_for(given, &args.out),
     };
     let options = SceneOptions { encode, coding: args.coding(), weights: path.weights.clone(), out: args.out.clone() };
-    let reader = ClipReader { source, options: config.data.clip_options() };
+    let options_of_views = model_args.clip_options(source.as_ref(), scene, args.crop)?;
+    let reader = ClipReader { source, options: options_of_views };
     let written = encode_scene(&model_args.open()?, &reader, scene, &options)?;
     if let Some(file) = clusters {
         file.write_json(&ClusterMap::new(&written.encoded))?;

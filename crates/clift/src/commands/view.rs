@@ -10,7 +10,7 @@ use clift_model::{DeviceName, ModelConfig, is_shipped};
 use clift_scene::{ContextChoice, Contexts, EncodeOptions, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
-use crate::commands::args::model_args::{ModelArgs, default_model, is_data};
+use crate::commands::args::model_args::{ModelArgs, PhotoCrop, default_model, is_data};
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::render::run::scene_weights;
@@ -106,7 +106,9 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     require_places(&model_args.config.model, &model_args.given)?;
     let is_training_data = model_args.folder.is_none();
     let frames = EvalFrames::new(&opened, args.split, model_args.config.data.hold_out, is_training_data);
-    let reader = ClipReader { source: opened.source, options: model_args.config.data.clip_options() };
+    // The pages of all scenes have images of one size.
+    let options = model_args.clip_options(opened.source.as_ref(), 0, PhotoCrop::Whole)?;
+    let reader = ClipReader { source: opened.source, options };
     // The index of a run lists frames of its own data.
     let has_index = args.overrides.set.iter().any(|set| set.starts_with("eval.index"));
     let (items, skip_report) = if is_training_data || has_index {

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use clift_data::{
-    DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset, open_source,
+    ClipOptions, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset, open_source,
 };
 use clift_model::{ModelConfig, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
-use clift_scene::ContextChoice;
+use clift_scene::{ContextChoice, photo_size};
 use clift_train::{Config, NewestCheckpoint, Override, TrainError};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
@@ -19,6 +19,16 @@ const MODEL_VARIABLE: &str = "CLIFT_MODEL";
 
 /// Relative difference in pixels per angle up to which images count as those of the training.
 const MAX_DENSITY_DIFFERENCE: f64 = 0.05;
+
+/// The part of a photo that the network sees.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum PhotoCrop {
+    /// Nearly all of it, if the network was trained with several image sizes.
+    #[default]
+    Whole,
+    /// The middle, with the proportions of the images of the training.
+    Trained,
+}
 
 /// A trained model, its config, and the folder of scenes that replaces the data of the config.
 pub struct ModelArgs {
@@ -130,6 +140,19 @@ impl ModelArgs {
         let (size, trained) = (words(size), words(trained));
         print_warning(format!("the network was trained on images of {trained}; images of {size} may lose quality"));
         Ok(())
+    }
+
+    /// Returns the preparation of the views of a scene: a network that was trained with several image sizes sees whole photos
+    /// of a folder, others see photos cropped to the size of the training.
+    pub fn clip_options(&self, source: &dyn SceneSource, scene: usize, crop: PhotoCrop) -> anyhow::Result<ClipOptions> {
+        let (options, stage1) = (self.config.data.clip_options(), &self.config.stage1);
+        let is_set = image_size(&self.config) != self.trained_size;
+        if self.folder.is_none() || is_set || stage1.further_sizes.is_empty() || crop == PhotoCrop::Trained {
+            return Ok(options);
+        }
+        let [width, height] =
+            photo_size(self.trained_size, self.config.model.patch_size, source.image_size(scene, 0)?);
+        Ok(ClipOptions { width, height, ..options })
     }
 
     /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder. A
