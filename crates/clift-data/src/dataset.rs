@@ -161,8 +161,8 @@ mod tests {
     use super::*;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::view_sampler::ViewSampler;
-    use crate::synthetic::config::Look;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+    use crate::synthetic::config::Look;
     use crate::testing::rooms;
     use clift_core::item_rng;
 

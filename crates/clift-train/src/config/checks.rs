@@ -76,8 +76,10 @@ impl Config {
     fn validate_further_sizes(&self) -> Result<(), BadConfig> {
         let (patch_size, most) = (self.model.patch_size, self.data.width * self.data.height);
         for size in &self.stage1.further_sizes {
-            let [is_small, has_patches] =
-                [size[0].saturating_mul(size[1]) <= most, size.iter().all(|&side| side > 0 && side.is_multiple_of(patch_size))];
+            let [is_small, has_patches] = [
+                size[0].saturating_mul(size[1]) <= most,
+                size.iter().all(|&side| side > 0 && side.is_multiple_of(patch_size)),
+            ];
             check_config(has_patches, "stage1.further_sizes", format!("{size:?}"), || {
                 format!("write multiples of model.patch_size = {patch_size}")
             })?;
@@ -113,7 +115,9 @@ impl Config {
         }
         let (multiple, least) = (2 * self.model.patch_size, 2 * PERCEPTUAL_MIN_SIZE_PX);
         let further = self.stage1.further_sizes.iter().flatten().map(|&side| ("stage1.further_sizes", side));
-        for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)].into_iter().chain(further) {
+        for (key, value) in
+            [("data.width", self.data.width), ("data.height", self.data.height)].into_iter().chain(further)
+        {
             if !value.is_multiple_of(multiple) {
                 let fix = format!("write 0, or a multiple of 2 x model.patch_size = {multiple} as {key}, not {value}");
                 return Err(bad("stage1.half_resolution", half, &fix));

@@ -4,9 +4,9 @@ use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
+use crate::network::architecture::RayFrame;
 use crate::network::blocks::block::DecoderBlock;
 use crate::network::blocks::pixels::{decode_image, embed_rays};
-use crate::network::architecture::RayFrame;
 use crate::network::camera_encoding::{TokenTransforms, TransformMaker};
 use crate::network::config::ModelConfig;
 use crate::network::design::{Patches, RendererBlocks};

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use clift_data::{
-    ClipOptions, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset, open_source,
+    ClipOptions, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
+    open_source,
 };
 use clift_model::{ModelConfig, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
 use clift_scene::{ContextChoice, photo_size};
@@ -150,8 +151,7 @@ impl ModelArgs {
         if self.folder.is_none() || is_set || stage1.further_sizes.is_empty() || crop == PhotoCrop::Trained {
             return Ok(options);
         }
-        let [width, height] =
-            photo_size(self.trained_size, self.config.model.patch_size, source.image_size(scene, 0)?);
+        let [width, height] = photo_size(self.trained_size, self.config.model.patch_size, source.image_size(scene, 0)?);
         Ok(ClipOptions { width, height, ..options })
     }
 
