@@ -4,7 +4,7 @@
 //! a computation gives the same bytes at every run on an adapter.
 //!
 //! - `adapter`: matrix instructions of an adapter
-//! - `buffers`: buffers and their vectors, elementwise kernels, sums of rows and columns
+//! - `buffers`: buffers and their vectors, elementwise kernels, sums of rows and columns, AdamW
 //! - `rows`: layer norm, RMS norm, GELU
 //! - `products`: products in f32 registers or cooperative matrices, and the table of their tiles
 //! - `attention`: attention, attention inside clusters, transforms of heads by cameras
@@ -37,6 +37,7 @@ pub use attention::attention::{
 pub use attention::cluster_attention::{ClusterSizes, cluster_attention_backward, cluster_attention_forward};
 pub use attention::head_transform::{PartTransform, transform_heads};
 pub use attention::matrix_scores::AttentionTile;
+pub use buffers::adamw::{AdamW, adamw, gradient_norm};
 pub use buffers::buffer::{Buffer, Matrices, Values};
 pub use buffers::elementwise::cast;
 pub use buffers::reduce::sum_rows;

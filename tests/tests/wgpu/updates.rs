@@ -46,8 +46,11 @@ fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: b
     let before = parameters(&learner.model);
     let (learner, update) = step(learner, &batch, parts);
     let after = parameters(&learner.model);
-    let moved = moved(&before, &after, &backward);
-    backward.extend(moved);
+    // The first update makes the moments of AdamW, the second one is a kernel's on GPUs.
+    let (learner, _) = step(learner, &batch, parts);
+    let moves =
+        [moved("update", &before, &after, &backward), moved("second", &after, &parameters(&learner.model), &backward)];
+    backward.extend(moves.into_iter().flatten());
     let numbers = [("loss", update.loss), ("mse", update.mse), ("gradient norm", update.grad_norm)];
     Values { forward: numbers.map(|(name, value)| (name.to_owned(), vec![value])).into(), backward }
 }
@@ -72,13 +75,13 @@ fn gradient(place: &Place, model: &Network, batch: &StageBatch) -> Named {
 
 /// Change of every weight in units of the learning rate, times its gradient:
 /// `AdamW`'s first update is the sign of the gradient, which is random where the gradient is rounding.
-fn moved(before: &Named, after: &Named, gradients: &Named) -> Named {
+fn moved(step: &str, before: &Named, after: &Named, gradients: &Named) -> Named {
     let weights = before.iter().zip(after);
     let moved = weights.filter_map(|((name, before), (_, after))| {
         let (_, gradient) = gradients.iter().find(|(of, _)| of == name)?;
         let moved = before.iter().zip(after).zip(gradient);
         let moved = moved.map(|((before, after), gradient)| (after - before) / LEARNING_RATE * gradient);
-        Some((format!("update of {name}"), moved.collect()))
+        Some((format!("{step} of {name}"), moved.collect()))
     });
     moved.collect()
 }

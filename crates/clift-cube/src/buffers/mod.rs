@@ -1,5 +1,6 @@
-//! Buffers, their loads in vectors of four, elementwise kernels, and sums of rows and columns.
+//! Buffers, their loads in vectors of four, elementwise kernels, sums of rows and columns, and AdamW.
 
+pub(crate) mod adamw;
 pub(crate) mod buffer;
 pub(crate) mod elementwise;
 pub(crate) mod load;

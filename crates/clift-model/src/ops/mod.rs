@@ -11,6 +11,8 @@
 //! - `cluster_attention`: attention inside clusters
 //! - `head_transform`: heads in the frame of a token's camera, for camera-relative attention
 //!
+//! Without a backward: `optimizer`, updates of parameters.
+//!
 //! Backends:
 //! - `kernels`: the trait
 //! - `composed`: its default implementations
@@ -32,5 +34,6 @@ pub(crate) mod head_transform;
 pub(crate) mod kernels;
 pub(crate) mod linear;
 pub(crate) mod mac_counter;
+pub(crate) mod optimizer;
 pub(crate) mod precision;
 pub(crate) mod rms_norm;

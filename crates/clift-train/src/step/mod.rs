@@ -1,5 +1,6 @@
 //! One optimizer step.
 //!
+//! - `adamw`: `AdamW`, by one kernel a parameter on GPUs
 //! - `batch`: host batch of one update
 //! - `device_batch`: a batch on a device; its loss
 //! - `gradient_sum`: gradients of all ranks
@@ -14,6 +15,7 @@
 //! - `step_guard`: skip anomalous steps
 
 pub(crate) mod activation_checkpointing;
+pub(crate) mod adamw;
 pub(crate) mod batch;
 pub(crate) mod device_batch;
 pub(crate) mod gradient_sum;

@@ -3,16 +3,17 @@
 use burn::module::{Module, ModuleVisitor, Param, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{
-    AdamWConfig, DynOptimizer, DynState, GradientsParams, LearningRate, ModuleOptimizer, OptimizerRecord, StateSink,
-    StateSource,
+    DynOptimizer, DynState, GradientsParams, LearningRate, ModuleOptimizer, OptimizerRecord, StateSink, StateSource,
 };
 use burn::tensor::kind::BridgeTensor;
 use burn::tensor::{Device, Tensor};
+use clift_model::fused_gradient_norm;
 
 use crate::config::config::{Algorithm, OptimizerConfig};
+use crate::step::adamw::AdamW;
 use crate::step::muon::Muon;
 
-/// The optimizer of a stage: AdamW with the released code's epsilon of 1e-8, and, if the config names Muon, Muon for the weight
+/// The optimizer of a stage: AdamW, and, if the config names Muon, Muon for the weight
 /// matrices of the transformer blocks. Weight decay applies to every parameter.
 ///
 /// Muon's updates are scaled to the size of AdamW's (`0.2 sqrt(max(rows, columns))`, arXiv 2502.16982), so that both
@@ -29,17 +30,14 @@ impl StageOptimizer {
     /// # Panics
     /// Never: the pattern of the paths is valid.
     pub fn new(config: &OptimizerConfig, device: &Device) -> Self {
-        let weight_decay = config.weight_decay as f32;
-        let [beta_1, beta_2] = config.betas.map(|beta| beta as f32);
-        let adamw = AdamWConfig::new().with_beta_1(beta_1).with_beta_2(beta_2).with_epsilon(1e-8);
-        let adamw = adamw.with_weight_decay(weight_decay).build();
+        let adamw = AdamW::new(config);
         let on_device = OnDevice { optimizer: adamw.clone(), device: device.clone().inner() };
         let all = ModuleOptimizer::from(adamw).with_group(ParamGroup::all(), on_device, None);
         match config.algorithm {
             Algorithm::Adamw => Self { all, muon: None },
             Algorithm::Muon => {
                 let matrices = ParamGroup::from_regex(r"(^|\.)blocks\..*\.weight$").expect("a valid pattern");
-                let muon = Muon::new(f64::from(weight_decay));
+                let muon = Muon::new(f64::from(config.weight_decay as f32));
                 let on_device = OnDevice { optimizer: muon.clone(), device: device.clone().inner() };
                 Self { all: all.with_group(matrices.clone(), on_device, None), muon: Some((muon, matrices)) }
             }
@@ -117,18 +115,29 @@ pub fn global_norm<M: Module>(module: &M, grads: &GradientsParams) -> f64 {
 pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<Tensor<1>> {
     struct Squares<'a> {
         grads: &'a GradientsParams,
+        /// Sums of squares, on the CPU.
         sums: Vec<Tensor<1>>,
+        /// Gradients on other devices.
+        others: Vec<Tensor<1>>,
     }
     impl ModuleVisitor for Squares<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             if let Some(grad) = self.grads.get::<D>(param.id) {
-                self.sums.push(grad.square().sum());
+                if grad.device() == Device::flex() {
+                    self.sums.push(grad.square().sum());
+                } else {
+                    self.others.push(grad.flatten(0, D - 1));
+                }
             }
         }
     }
-    let mut squares = Squares { grads, sums: Vec::new() };
+    let mut squares = Squares { grads, sums: Vec::new(), others: Vec::new() };
     module.visit(&mut squares);
-    (!squares.sums.is_empty()).then(|| Tensor::cat(squares.sums, 0).sum().sqrt())
+    let Squares { mut sums, others, .. } = squares;
+    fused_gradient_norm(&others).or_else(|| {
+        sums.extend(others.into_iter().map(|grad| grad.square().sum()));
+        (!sums.is_empty()).then(|| Tensor::cat(sums, 0).sum().sqrt())
+    })
 }
 
 /// Scales all gradients of a module by `max_norm / norm` where `norm` is larger.
@@ -163,7 +172,7 @@ pub fn scale_gradients<M: Module>(module: &M, grads: GradientsParams, factor: f6
 
 #[cfg(test)]
 mod tests {
-    use burn::optim::AdamWState;
+    use burn::optim::{AdamWConfig, AdamWState};
     use burn::tensor::TensorData;
 
     use super::*;

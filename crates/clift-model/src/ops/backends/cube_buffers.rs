@@ -1,10 +1,24 @@
 //! Tensors of `CubeCL` as buffers of `clift-cube`.
 
-use burn::backend::TensorMetadata;
-use burn::tensor::{DType, Shape};
+use burn::backend::{BackendTensor, DispatchAutodiffContext, DispatchTensor, DispatchTensorKind, TensorMetadata};
+use burn::tensor::{DType, Shape, Tensor};
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use clift_cube::{Buffer, Matrices, Values};
+
+/// Returns the tensor of `CubeCL` behind a tensor without autodiff, if the kernels accept it.
+pub(crate) fn cube_tensor<const D: usize>(x: &Tensor<D>) -> Option<CubeTensor> {
+    match x.clone().into_dispatch().kind {
+        DispatchTensorKind::Cube(BackendTensor::Float(x)) if is_native(&x) => Some(x),
+        _ => None,
+    }
+}
+
+/// Returns a tensor without autodiff.
+pub(crate) fn float_tensor<const D: usize>(x: CubeTensor) -> Tensor<D> {
+    let kind = DispatchTensorKind::Cube(BackendTensor::Float(x));
+    Tensor::from_dispatch(DispatchTensor { kind, autodiff: DispatchAutodiffContext::default() })
+}
 
 /// Returns whether the kernels accept the tensor: f64 and f16 take the composed operations.
 pub(crate) fn is_native(x: &CubeTensor) -> bool {

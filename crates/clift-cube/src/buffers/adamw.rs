@@ -1,0 +1,197 @@
+//! AdamW and the norm of gradients, one launch a tensor each.
+
+use cubecl::prelude::*;
+
+use crate::buffers::buffer::{Buffer, Values};
+use crate::buffers::elementwise::{UNITS, cube_count, elementwise};
+use crate::buffers::reduce::{sum_of_row, sum_of_vector};
+
+/// Vectors that a unit adds.
+const VECTORS: usize = 16;
+
+/// Factors of an update.
+#[derive(CubeType, CubeLaunch, Clone, Copy, Debug)]
+pub struct AdamW {
+    /// Learning rate.
+    pub learning_rate: f32,
+    /// Decay of the parameters, per learning rate.
+    pub weight_decay: f32,
+    /// Decay of the mean of the gradients.
+    pub beta_1: f32,
+    /// Decay of the mean of their squares.
+    pub beta_2: f32,
+    /// `1 - beta_1^t` at update `t`.
+    pub correction_1: f32,
+    /// `1 - beta_2^t` at update `t`.
+    pub correction_2: f32,
+    /// Added to the root of the mean square.
+    pub epsilon: f32,
+}
+
+#[cube(launch_unchecked)]
+fn update<V: Size>(
+    parameter: &[Vector<f32, V>],
+    mean: &[Vector<f32, V>],
+    square: &[Vector<f32, V>],
+    grad: &[Vector<f32, V>],
+    new_parameter: &mut [Vector<f32, V>],
+    new_mean: &mut [Vector<f32, V>],
+    new_square: &mut [Vector<f32, V>],
+    rates: AdamW,
+) {
+    let index = ABSOLUTE_POS;
+    if index < grad.len() {
+        let one = Vector::<f32, V>::new(1.0);
+        let grad = grad[index];
+        let old = Vector::<f32, V>::new(rates.beta_1);
+        let mean = old * mean[index] + (one - old) * grad;
+        let old = Vector::<f32, V>::new(rates.beta_2);
+        let square = old * square[index] + (one - old) * grad * grad;
+        let root = (square / Vector::<f32, V>::new(rates.correction_2)).sqrt();
+        let step = mean / Vector::<f32, V>::new(rates.correction_1) / (root + Vector::<f32, V>::new(rates.epsilon));
+        let kept = Vector::<f32, V>::new(1.0 - rates.learning_rate * rates.weight_decay);
+        new_parameter[index] = parameter[index] * kept - step * Vector::<f32, V>::new(rates.learning_rate);
+        new_mean[index] = mean;
+        new_square[index] = square;
+    }
+}
+
+/// Returns the parameter, the mean of its gradients and the mean of their squares after an update by a gradient.
+pub fn adamw(client: &Client, settings: AdamW, inputs: [&Buffer; 3], grad: &Buffer) -> [Buffer; 3] {
+    let outputs = inputs.map(|input| Buffer::empty(client, input.len, Values::F32));
+    let ([parameter, mean, square], [new_parameter, new_mean, new_square]) = (inputs, &outputs);
+    let (vector, count) = elementwise(grad.len);
+    let AdamW { learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon } = settings;
+    // SAFETY: the kernel compares its index with the length.
+    unsafe {
+        update::launch_unchecked(
+            client,
+            count,
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            parameter.arg(vector),
+            mean.arg(vector),
+            square.arg(vector),
+            grad.arg(vector),
+            new_parameter.arg(vector),
+            new_mean.arg(vector),
+            new_square.arg(vector),
+            AdamWLaunch::new(learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon),
+        );
+    }
+    outputs
+}
+
+/// Writes the sum of the squares of a chunk of the values to `sums[first + cube]`.
+#[cube(launch_unchecked)]
+fn add_squares<V: Size>(x: &[Vector<f32, V>], sums: &mut [f32], first: usize, count: usize) {
+    let cube = CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize;
+    let mut stage = Shared::<[f32]>::new_slice(UNITS);
+    let mut sum = Vector::<f32, V>::new(0.0);
+    for i in 0..VECTORS {
+        let index = (cube * VECTORS + i) * UNITS + UNIT_POS as usize;
+        if index < x.len() {
+            sum += x[index] * x[index];
+        }
+    }
+    let sum = sum_of_row(sum_of_vector(sum), &mut stage, UNITS);
+    if UNIT_POS == 0 {
+        if cube < count {
+            sums[first + cube] = sum;
+        }
+    }
+}
+
+/// Writes the root of the sum of `sums`.
+#[cube(launch_unchecked)]
+fn finish_norm(sums: &[f32], norm: &mut [f32]) {
+    let mut stage = Shared::<[f32]>::new_slice(UNITS);
+    let mut sum = 0.0f32;
+    let mut i = UNIT_POS as usize;
+    while i < sums.len() {
+        sum += sums[i];
+        i += UNITS;
+    }
+    let root = sum_of_row(sum, &mut stage, UNITS).sqrt();
+    if UNIT_POS == 0 {
+        norm[0] = root;
+    }
+}
+
+/// Computes the norm of all gradients together, `[1]`.
+pub fn gradient_norm(client: &Client, grads: &[Buffer]) -> Buffer {
+    let chunks = |x: &Buffer| {
+        let vector = if x.len.is_multiple_of(4) { 4 } else { 1 };
+        (vector, (x.len / vector).div_ceil(UNITS * VECTORS))
+    };
+    let sums = Buffer::empty(client, grads.iter().map(|x| chunks(x).1).sum(), Values::F32);
+    let norm = Buffer::empty(client, 1, Values::F32);
+    let dim = CubeDim::new_1d(UNITS as u32);
+    let mut first = 0;
+    // SAFETY: the kernels compare their indices with the lengths.
+    unsafe {
+        for x in grads {
+            let (vector, count) = chunks(x);
+            add_squares::launch_unchecked(
+                client,
+                cube_count(count),
+                dim,
+                vector,
+                x.arg(vector),
+                sums.arg(1),
+                first,
+                count,
+            );
+            first += count;
+        }
+        finish_norm::launch_unchecked(client, CubeCount::Static(1, 1, 1), dim, sums.arg(1), norm.arg(1));
+    }
+    norm
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{client, random, read, upload, worst};
+
+    #[test]
+    fn updates_equal_f64() {
+        let Some(client) = client() else { return };
+        let settings = AdamW {
+            learning_rate: 1e-2,
+            weight_decay: 0.05,
+            beta_1: 0.9,
+            beta_2: 0.95,
+            correction_1: 0.1,
+            correction_2: 0.05,
+            epsilon: 1e-8,
+        };
+        for len in [1, 37, 5000] {
+            let values = [1, 2, 3, 4].map(|seed| random(len, seed));
+            let square: Vec<f32> = values[2].iter().map(|x| x * x).collect();
+            let inputs = [&values[0], &values[1], &square].map(|x| upload(&client, x, Values::F32));
+            let grad = upload(&client, &values[3], Values::F32);
+            let results = adamw(&client, settings, inputs.each_ref(), &grad);
+            let expected = (0..len).map(|i| {
+                let [p, m, s, g] = [values[0][i], values[1][i], square[i], values[3][i]].map(f64::from);
+                let (m, s) = (0.9 * m + 0.1 * g, 0.95 * s + 0.05 * g * g);
+                [p * (1.0 - 1e-2 * 0.05) - 1e-2 * (m / 0.1) / ((s / 0.05).sqrt() + 1e-8), m, s]
+            });
+            let expected: Vec<[f64; 3]> = expected.collect();
+            for (i, result) in results.iter().enumerate() {
+                let expected: Vec<f64> = expected.iter().map(|values| values[i]).collect();
+                assert!(worst(&read(&client, result), &expected) < 1e-6, "result {i} of {len} values");
+            }
+            assert_eq!(read(&client, &inputs[0]), values[0], "the inputs stay");
+        }
+    }
+
+    #[test]
+    fn the_norm_is_that_of_all_gradients() {
+        let Some(client) = client() else { return };
+        let grads = [(5, 1), (40_000, 2), (37, 3)].map(|(len, seed)| random(len, seed));
+        let buffers = grads.each_ref().map(|x| upload(&client, x, Values::F32));
+        let norm = grads.iter().flatten().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
+        assert!(worst(&read(&client, &gradient_norm(&client, &buffers)), &[norm]) < 1e-6);
+    }
+}

@@ -1,0 +1,53 @@
+//! AdamW: Burn's, on GPUs by one kernel a parameter.
+
+use burn::optim::{AdamWConfig, AdamWState, AdaptiveMomentumState, LearningRate, Optimizer};
+use burn::tensor::{Device, Tensor};
+use clift_model::{AdamWFactors, fused_adamw};
+
+use crate::config::config::OptimizerConfig;
+
+/// The released code's epsilon.
+const EPSILON: f32 = 1e-8;
+
+/// AdamW of a config.
+#[derive(Clone)]
+pub struct AdamW {
+    plain: burn::optim::AdamW,
+    betas: [f32; 2],
+    weight_decay: f32,
+}
+
+impl AdamW {
+    pub fn new(config: &OptimizerConfig) -> Self {
+        let (betas, weight_decay) = (config.betas.map(|beta| beta as f32), config.weight_decay as f32);
+        let plain = AdamWConfig::new().with_beta_1(betas[0]).with_beta_2(betas[1]).with_epsilon(EPSILON);
+        Self { plain: plain.with_weight_decay(weight_decay).build(), betas, weight_decay }
+    }
+}
+
+impl Optimizer for AdamW {
+    type State<const D: usize> = AdamWState<D>;
+
+    fn step<const D: usize>(
+        &self,
+        learning_rate: LearningRate,
+        tensor: Tensor<D>,
+        grad: Tensor<D>,
+        state: Option<AdamWState<D>>,
+    ) -> (Tensor<D>, Option<AdamWState<D>>) {
+        if let Some(AdamWState { momentum }) = &state {
+            let Self { betas, weight_decay, .. } = *self;
+            let time = momentum.time + 1;
+            let factors = AdamWFactors { learning_rate, weight_decay, betas, epsilon: EPSILON, time };
+            let tensors = [&tensor, &momentum.moment_1, &momentum.moment_2];
+            if let Some([tensor, mean, square]) = fused_adamw(tensors, &grad, factors) {
+                return (tensor, Some(AdamWState::new(AdaptiveMomentumState::new(time, mean, square))));
+            }
+        }
+        self.plain.step(learning_rate, tensor, grad, state)
+    }
+
+    fn to_device<const D: usize>(state: AdamWState<D>, device: &Device) -> AdamWState<D> {
+        burn::optim::AdamW::to_device(state, device)
+    }
+}
