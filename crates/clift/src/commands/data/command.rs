@@ -16,7 +16,7 @@ pub enum DataCommand {
     ///
     /// Ray-traced scenes with exact cameras are written to OUT/train and OUT/test as NNNNNN.torch files, which
     /// `torch.load` reads too, with an index.json per folder. The test split also gets `OUT/evaluation_index.json`, for
-    /// `clift eval --index`. The command prints the config section that trains on these scenes.
+    /// `clift eval --index`.
     #[command(after_help = "\
 Examples:
   clift data synth /data/rooms
@@ -78,9 +78,8 @@ Examples:
     ///
     /// Writes the splits of DIR to OUT/train and OUT/test. A data set without splits, such as captures, becomes OUT itself,
     /// unless `data.files.test_scenes` divides it. Image files are copied byte by byte, unless their lens distortion is
-    /// removed or --max-size reduces them.
-    /// An interrupted conversion resumes: SHA256SUMS lists the complete files, and `sha256sum -c SHA256SUMS` verifies
-    /// them at any time. Exits with 1 if an image is unreadable or no scene of a split can be converted.
+    /// removed or --max-size reduces them. The files of a split appear when all are complete. Exits with 1 if an image is
+    /// unreadable or no scene of a split can be converted.
     #[command(after_help = "\
 Examples:
   clift data convert captures/fox fox-chunks --to chunks --max-size 512 --quality 95
