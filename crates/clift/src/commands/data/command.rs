@@ -41,18 +41,15 @@ Examples:
   clift data poses attic.mp4 -o captures/attic --frames 150
   clift data poses photos/walk -o captures/walk --matching neighbours")]
     Poses(PosesArgs),
-    /// Describe a data set, a config's use of it, or an evaluation index
+    /// Describe a data set or an evaluation index
     ///
     /// Recognises every layout: chunks, files per scene, RealEstate10K text files, DL3DV folders, captures with
     /// transforms.json or a COLMAP model. Prints per split: scenes, frames (smallest / median / largest), image size,
-    /// field of view, extent of the camera path, frames without an image. For a config also the scenes that remain after
-    /// its filters, views and evaluation, and the tokens per scene.
+    /// field of view, extent of the camera path, frames without an image.
     #[command(after_help = "\
 Examples:
   clift data info /data/re10k
-  clift data info captures/attic
-  clift data info configs/tiny.toml
-  clift data info configs/re10k.toml --set data.filters.min_frames=60 --json info.json")]
+  clift data info captures/attic --json info.json")]
     Info(InfoArgs),
     /// Check images, cameras, and whether poses match the images
     ///
