@@ -31,5 +31,5 @@ pub use precision::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_prec
 pub use data_reading::{ReadClip, Throughput, ThroughputOptions, measure_reading};
 // Devices and numerical stability
 pub use doctor::probe::{DeviceCheck, Gradient, catch_panic, probe};
-pub use doctor::stability::case::{Bound, CaseSize, Outcome, StabilityCase, StabilityRow};
+pub use doctor::stability::case::{CaseSize, StabilityCase, StabilityRow};
 pub use doctor::stability::suite::{outcome_text, run_stability, stability_markdown};
