@@ -9,9 +9,6 @@ use sha2::{Digest, Sha256};
 use crate::error::DataError;
 
 /// Returns the SHA-256 of a file in hexadecimal.
-///
-/// # Errors
-/// [`DataError::Io`].
 pub fn hash_file(path: &Path) -> Result<String, DataError> {
     let reading = || DataError::io("reading a file for its checksum", path);
     let mut file = File::open(path).map_err(reading())?;

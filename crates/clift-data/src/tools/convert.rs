@@ -113,9 +113,6 @@ impl<'a> Converter<'a> {
     ///
     /// Unreadable scenes are skipped, with the reason in the result and in `skipped.json`. Unreadable image files are
     /// copied, with the reason in the result and in `unreadable.json`.
-    ///
-    /// # Errors
-    /// [`DataError::Io`] from writing.
     pub fn run(mut self, mut progress: impl FnMut(usize)) -> Result<ConversionReport, DataError> {
         let files = StagedDir::new(&self.folder).map_err(DataError::io("making the folder", &self.folder))?;
         for scene in 0..self.source.num_scenes() {

@@ -335,9 +335,6 @@ fn check_counts(eval: &EvalConfig, fewest_tokens: usize, architecture: Architect
 }
 
 /// Writes skipped scenes with their reasons as JSON.
-///
-/// # Errors
-/// [`EvalError::Io`].
 pub fn write_skip_report(skip_report: &SkipReport, path: &Path) -> Result<(), EvalError> {
     let text = serde_json::to_vec_pretty(skip_report).map_err(std::io::Error::from);
     text.and_then(|text| replace_file(path, &text)).map_err(EvalError::io("writing the skipped scenes", path))

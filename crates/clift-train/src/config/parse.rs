@@ -76,9 +76,6 @@ fn read_text(path: &Path) -> std::io::Result<String> {
 }
 
 /// Does [`read_checked_config`] on a text; `path` is only used in messages.
-///
-/// # Errors
-/// As [`read_checked_config`].
 pub fn parse_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     file: &str,

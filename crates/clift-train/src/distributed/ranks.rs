@@ -86,9 +86,6 @@ impl Ranks {
     }
 
     /// Returns whether the flag of any rank is set.
-    ///
-    /// # Errors
-    /// As [`Ranks::gather`].
     pub fn any(&self, flag: bool) -> Result<bool, TrainError> {
         Ok(self.gather(flag)?.contains(&true))
     }

@@ -13,9 +13,6 @@ use crate::doctor::stability::{attention, clusters, training, updates};
 const CASES: [&[StabilityCase]; 4] = [updates::CASES, clusters::CASES, attention::CASES, training::CASES];
 
 /// Runs every case on the devices and passes each finished row to `report`.
-///
-/// # Errors
-/// Those of opening a device.
 pub fn run_stability(
     devices: &[DeviceName],
     size: CaseSize,
