@@ -129,7 +129,7 @@ fn operation_error(
         let cotangent = output.clone().inner().cos();
         let mut grads = (output.clone() * cotangent.autodiff()).sum().backward();
         let [a, b] = leaves.map(|leaf| {
-            leaf.grad_remove(&mut grads).ok_or_else(|| TrainError::Tensor { reason: "an input has no gradient".into() })
+            leaf.grad_remove(&mut grads).ok_or_else(|| TrainError::Device { reason: "an input has no gradient".into() })
         });
         Ok([output.inner(), a?, b?])
     };
