@@ -26,6 +26,8 @@ struct ViewRow {
     render_s: Option<f64>,
     select_s: Option<f64>,
     tokens: Option<TokenCoding>,
+    /// Frame numbers, separated by spaces.
+    context_frames: Option<String>,
 }
 
 /// A row of `scenes.csv`.
@@ -53,7 +55,6 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
             let ViewMetrics { psnr, ssim, lpips_vgg, sharpness, render_s, select_s } = *view;
             let scene = scene.clone();
             ViewRow {
-                scene,
                 target_frame,
                 method,
                 num_storage_tokens,
@@ -65,6 +66,8 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
                 render_s,
                 select_s,
                 tokens,
+                context_frames: results.context_list(&scene),
+                scene,
             }
         })
     });
@@ -107,10 +110,7 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
             ssim: view_mean(views, SSIM),
             lpips_vgg: view_mean(views, LPIPS),
             sharpness: view_mean(views, SHARPNESS),
-            context_frames: results
-                .context_frames
-                .get(scene)
-                .map(|frames| frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")),
+            context_frames: results.context_list(scene),
         })
     });
     write(path, rows).map_err(EvalError::io("writing the means of the scenes", path))
@@ -141,11 +141,11 @@ mod tests {
             ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.5, None)),
         ];
         let views = "\
-scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,sharpness,render_s,select_s,tokens
-attic,2,clift,64,32,23.0,0.5,0.75,0.875,0.25,,f16
-attic,9,clift,64,32,20.0,0.5,0.25,0.875,0.25,,f16
-\"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.875,0.25,,f16
-attic,9,nearest_view,0,0,18.5,,,,,,
+scene,target_frame,method,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,sharpness,render_s,select_s,tokens,context_frames
+attic,2,clift,64,32,23.0,0.5,0.75,0.875,0.25,,f16,0 5 12
+attic,9,clift,64,32,20.0,0.5,0.25,0.875,0.25,,f16,0 5 12
+\"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.875,0.25,,f16,
+attic,9,nearest_view,0,0,18.5,,,,,,,0 5 12
 ";
         let scenes = "\
 scene,method,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg,sharpness,context_frames
@@ -166,7 +166,7 @@ attic,nearest_view,0,0,,1,18.5,,,,0 5 12
             write_scenes(&results, &path).unwrap();
             assert_eq!(std::fs::read_to_string(&path).unwrap(), scenes);
         }
-        std::fs::write(&path, format!("{views}attic,2,clift,64,32,24.0,0.5,0.75,,0.25,,f16\n")).unwrap();
+        std::fs::write(&path, format!("{views}attic,2,clift,64,32,24.0,0.5,0.75,,0.25,,f16,\n")).unwrap();
         let message = read_views(&path).unwrap_err().to_string();
         assert!(message.contains("frame 2 of scene attic has two rows of clift"), "{message}");
     }

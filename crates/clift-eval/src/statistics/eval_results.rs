@@ -69,6 +69,12 @@ impl EvalResults {
         frames.len() > num_views
     }
 
+    /// Returns the context frames of a scene, separated by spaces.
+    pub(crate) fn context_list(&self, scene: &str) -> Option<String> {
+        let frames = self.context_frames.get(scene)?;
+        Some(frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(" "))
+    }
+
     /// Adds the views that another process has measured of other scenes.
     pub(crate) fn merge(&mut self, other: Self) {
         for (key, scenes) in other.views {

@@ -175,5 +175,7 @@ mod tests {
         assert_eq!(after(vec![(1.0, 1.0); 20]).medians(), [Some(1.0); 2]);
         let steps = (0..202).map(|i| if i < 101 { (1.0, 1.0) } else { (7.0, 8.0) });
         assert_eq!(after(steps).medians(), [Some(7.0), Some(8.0)]);
+        let steps = (1..=102).map(|i| (f64::from(i), 2.0 * f64::from(i)));
+        assert_eq!(after(steps).medians(), [Some(52.0), Some(104.0)], "the first step is forgotten");
     }
 }
