@@ -154,7 +154,7 @@ fn network_error(
     batch: &StageBatch,
 ) -> Result<f64, TrainError> {
     let model = freeze(stage, seeded_model(config, 0, &devices.device));
-    Ok(update_error(&model, batch, &devices.device, &devices.reference, NOISE_SHARE)?)
+    update_error(&model, batch, &devices.device, &devices.reference, NOISE_SHARE)
 }
 
 fn all_views(clip: &mut Clip) -> [&mut ClipViews; 2] {
