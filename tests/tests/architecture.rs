@@ -42,7 +42,7 @@ const CRATES: [Crate; 11] = [
     (
         "clift-bench",
         "clift-core clift-kernels clift-model clift-data clift-scene clift-eval clift-train",
-        "allreduce cases data_reading runner precision doctor",
+        "cases data_reading runner precision doctor",
     ),
     (
         "clift-view",

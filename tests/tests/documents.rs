@@ -230,10 +230,6 @@ fn shrink(args: &mut Vec<String>) {
             default(args, "--size", "32x32");
         }
         ("data", Some("poses")) => "photos".clone_into(&mut args[2]), // for a film too
-        ("data", Some("info")) if args.iter().any(|arg| arg == "configs/re10k.toml") => {
-            set(args, &SMALL_RUN[1..6]);
-            set(args, &["data.root=PATH"]);
-        }
         ("data", Some("index")) if !args.iter().any(|arg| arg == "--distance") => {
             args.extend(["--distance", "4..7", "--targets", "1"].map(str::to_owned));
         }

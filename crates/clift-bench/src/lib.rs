@@ -15,7 +15,6 @@
 //! # Ok::<(), clift_train::TrainError>(())
 //! ```
 
-mod allreduce;
 mod cases;
 mod data_reading;
 mod doctor;
@@ -30,9 +29,7 @@ pub use runner::{BenchEvent, BenchReport, BenchRow, run_bench};
 pub use precision::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precision};
 // Reading of clips
 pub use data_reading::{ReadClip, Throughput, ThroughputOptions, measure_reading};
-// The sum over ranks
-pub use allreduce::{AllReduceReport, AllReduceRow, measure_allreduce};
 // Devices and numerical stability
 pub use doctor::probe::{DeviceCheck, Gradient, catch_panic, probe};
-pub use doctor::stability::case::{Bound, CaseSize, Outcome, StabilityCase, StabilityRow};
+pub use doctor::stability::case::{CaseSize, StabilityCase, StabilityRow};
 pub use doctor::stability::suite::{outcome_text, run_stability, stability_markdown};

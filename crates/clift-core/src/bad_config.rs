@@ -27,9 +27,6 @@ impl BadConfig {
 }
 
 /// Returns a [`BadConfig`] unless the value of `key` is valid.
-///
-/// # Errors
-/// Key, value and `fix`.
 pub fn check_config(
     is_valid: bool,
     key: &str,

@@ -3,13 +3,11 @@
 /// A camera that cannot be used, or cameras without a normalized frame.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the message of a variant says what its fields are")]
 pub enum CameraError {
     /// A camera holds a NaN or an infinity, its rotation matrix is not orthonormal, or it is too far away.
     #[error("bad camera: {what}")]
-    BadCamera {
-        /// Problem and the value found.
-        what: String,
-    },
+    BadCamera { what: String },
     /// The camera centres that define a scene's scale coincide.
     #[error(
         "scene {key} has no baseline: {}; the method needs parallax, photos from different places: a camera that only turns on \
@@ -22,24 +20,8 @@ pub enum CameraError {
             ),
         }
     )]
-    ZeroBaseline {
-        /// Scene key.
-        key: String,
-        /// Number of views that define the scale.
-        num_views: usize,
-        /// Largest distance from the mean centre along an axis, in world units.
-        extent: f64,
-        /// Smallest accepted extent, in world units.
-        threshold: f64,
-    },
+    ZeroBaseline { key: String, num_views: usize, extent: f64, threshold: f64 },
     /// A pose of a scene cannot be used.
     #[error("frame {frame} of scene {key}: {source}")]
-    InFrame {
-        /// Scene key.
-        key: String,
-        /// Position of the pose.
-        frame: usize,
-        /// Cause.
-        source: Box<CameraError>,
-    },
+    InFrame { key: String, frame: usize, source: Box<CameraError> },
 }

@@ -80,9 +80,6 @@ fn open_files(
 
 /// Opens the training split as [`open_dataset`] does, without the frames of `data.hold_out` where the data set has no test
 /// split, and skips the scenes that are too short for `data.views` at `last_step`, when its gaps are largest.
-///
-/// # Errors
-/// As [`open_dataset`].
 pub fn open_training_dataset(
     config: &DataConfig,
     last_step: u64,

@@ -77,9 +77,9 @@ pub use image::fit::{Crop, fit_image};
 pub use image::undistort::Undistortion;
 
 // Tools for data sets: describe, check, convert, index.
+pub use files::hash::hash_file;
 pub use tools::check::result::{FrameCheck, PairCheck, SceneCheck, Verdict};
 pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, skipped_scenes};
-pub use tools::checksums::hash_file;
 pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
 pub use tools::export::{ImageEncoding, read_scene, write_evaluation_index};
 pub use tools::index_statistics::IndexStatistics;

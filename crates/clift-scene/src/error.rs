@@ -3,32 +3,22 @@
 /// An error of this crate.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the message of a variant says what its fields are")]
 pub enum SceneError {
     /// A request that the scene or the model cannot meet.
     #[error("{reason}")]
-    BadRequest {
-        /// The problem and the remedy.
-        reason: String,
-    },
+    BadRequest { reason: String },
     /// A scene without context views has no baseline.
     #[error("baselines need at least one context view, got none")]
     NoContext,
     /// No scene is left to fit a codec on.
     #[error("no usable scene: {reason}")]
-    NoScenes {
-        /// Reasons of the skipped scenes.
-        reason: String,
-    },
+    NoScenes { reason: String },
     /// The caller stopped the fit of a codec.
     #[error(
         "interrupted while fitting the token codec, after {done} of {total} scenes; no codec was written: the same command fits it"
     )]
-    Interrupted {
-        /// Scenes that were read.
-        done: usize,
-        /// All scenes that the fit reads.
-        total: usize,
-    },
+    Interrupted { done: usize, total: usize },
     /// Images could not be read.
     #[error(transparent)]
     Data(#[from] clift_data::DataError),

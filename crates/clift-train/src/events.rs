@@ -83,100 +83,35 @@ pub struct StepEvent {
     pub peak_bytes: Option<u64>,
 }
 
-/// An event of a run.
+/// An event of a run. Steps count from 1 in their stage, `done` ones are finished; times are in seconds, PSNR in dB.
 #[derive(Clone, Debug, PartialEq)]
+#[expect(missing_docs, reason = "the fields are described with their variants")]
 pub enum Event {
     /// Chunks of a data set were examined for its filters.
-    Scan {
-        /// Number of examined chunks.
-        done: usize,
-        /// Number of all chunks.
-        total: usize,
-    },
-    /// A step of the run starts or resumes.
-    StepStarted {
-        /// The step of the run.
-        run_step: RunStep,
-        /// Steps done before: 0, or the step of the checkpoint.
-        done: u64,
-        /// Number of steps; of context sets for the cluster cache.
-        num_steps: u64,
-    },
-    /// The following steps of a stage have images of this size, where a stage has images of two sizes.
-    ImageSize {
-        /// The stage.
-        stage: Stage,
-        /// Columns and rows of an image.
-        size: [usize; 2],
-        /// Steps done before.
-        done: u64,
-        /// Last step with images of this size.
-        last_step_of_size: u64,
-        /// Last step of the stage.
-        last_step: u64,
-    },
+    Scan { done: usize, total: usize },
+    /// A step of the run starts, or resumes at a checkpoint. The cluster cache has context sets as its steps.
+    StepStarted { run_step: RunStep, done: u64, num_steps: u64 },
+    /// The following steps of a stage have images of this size, columns and rows, where a stage has images of two sizes.
+    ImageSize { stage: Stage, size: [usize; 2], done: u64, last_step_of_size: u64, last_step: u64 },
     /// An update was made.
     Step(StepEvent),
-    /// The first steps of a new stage were measured.
-    Pace {
-        /// The stage.
-        stage: Stage,
-        /// Steps done.
-        step: u64,
-        /// Last step with images of the present size.
-        last_step_of_size: u64,
-        /// Last step of the stage.
-        last_step: u64,
-        /// Mean wall time of a step with its batch in seconds, without the first step.
-        step_s: f64,
-        /// Peak memory of the process; `None` if the system does not report it.
-        peak_bytes: Option<u64>,
-    },
+    /// The first steps of a new stage were measured: mean wall time of a step with its batch, without the first step, and peak
+    /// memory of the process, `None` if the system does not report it.
+    Pace { stage: Stage, step: u64, last_step_of_size: u64, last_step: u64, step_s: f64, peak_bytes: Option<u64> },
     /// A context set of the cluster cache or a scene of an evaluation was processed.
-    Progress {
-        /// The step of the run.
-        run_step: RunStep,
-        /// Number done.
-        done: u64,
-        /// Number in total.
-        total: u64,
-    },
-    /// Validation views were measured.
-    Evaluated {
-        /// The stage.
-        stage: Stage,
-        /// Step of the stage.
-        step: u64,
-        /// Mean PSNR in dB.
-        psnr: f64,
-        /// Mean SSIM; `None` for images below 11 pixels.
-        ssim: Option<f64>,
-        /// Number of views.
-        num_views: usize,
-    },
-    /// A checkpoint was saved.
-    Checkpoint {
-        /// Folder of the checkpoint.
-        path: PathBuf,
-    },
+    Progress { run_step: RunStep, done: u64, total: u64 },
+    /// Validation views were measured. SSIM is `None` for images below 11 pixels.
+    Evaluated { stage: Stage, step: u64, psnr: f64, ssim: Option<f64>, num_views: usize },
+    /// A checkpoint was saved in a folder.
+    Checkpoint { path: PathBuf },
     /// A scene was skipped.
-    Skipped {
-        /// Key of the scene.
-        key: String,
-        /// Reason.
-        reason: String,
-    },
+    Skipped { key: String, reason: String },
     /// A problem that does not stop the run.
     Warning(String),
     /// Information for the log.
     Message(String),
-    /// A step of the run is finished.
-    StepFinished {
-        /// The step of the run.
-        run_step: RunStep,
-        /// Seconds of wall time since the start or the resumption.
-        elapsed_s: f64,
-    },
+    /// A step of the run is finished, so long after the start or the resumption.
+    StepFinished { run_step: RunStep, elapsed_s: f64 },
 }
 
 /// Receiver of events. A sink does not stop a run; a failing one reports the failure at the end.

@@ -47,7 +47,7 @@ pub use distributed::communicator::Communicator;
 pub use distributed::launch::Launched;
 pub use distributed::machine::RankPlace;
 pub use distributed::parts::BatchParts;
-pub use distributed::ranks::{Ranks, sent_bytes};
+pub use distributed::ranks::Ranks;
 // A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, RunStep, Sink, Stage, StepEvent};

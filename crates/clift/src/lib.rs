@@ -62,7 +62,6 @@ pub fn main() -> ExitCode {
         Command::Metrics(args) => metrics::run(&args),
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run::run(&args),
-        Command::Bench(BenchArgs { command: Some(BenchCommand::Allreduce(args)), .. }) => bench::allreduce::run(&args),
         Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => bench::data::run(&args),
         Command::Bench(BenchArgs { command: Some(BenchCommand::Precision(args)), .. }) => bench::precision::run(&args),
         Command::Bench(args) => bench::cases::run(&args),

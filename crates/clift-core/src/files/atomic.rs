@@ -10,9 +10,6 @@ pub const TEMPORARY: &str = ".clift-";
 
 /// Replaces the file at `path` atomically; after an error the former file is unchanged. The file has the permissions of
 /// the umask.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn replace_file(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let folder = folder_of(path);
     let mut builder = tempfile::Builder::new();
@@ -27,9 +24,6 @@ pub fn replace_file(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
 }
 
 /// Renames the finished file `temporary` to `path`, with the permissions that a new file would have.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn publish_file(temporary: &Path, path: &Path) -> std::io::Result<()> {
     // Windows syncs only files that are open for writing.
     let file = File::options().write(true).open(temporary)?;
@@ -42,9 +36,6 @@ pub fn publish_file(temporary: &Path, path: &Path) -> std::io::Result<()> {
 
 /// Renames the finished folder `temporary` to `path`, which must not exist, after syncing its files. Subfolders are not
 /// allowed.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn publish_folder(temporary: &Path, path: &Path) -> std::io::Result<()> {
     for item in std::fs::read_dir(temporary)? {
         // Windows syncs only files that are open for writing.
@@ -56,9 +47,6 @@ pub fn publish_folder(temporary: &Path, path: &Path) -> std::io::Result<()> {
 }
 
 /// Creates a folder and its missing parents, and syncs them.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn make_folder(path: &Path) -> std::io::Result<()> {
     let is_new = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
     let new: Vec<&Path> = path.ancestors().take_while(is_new).collect();
@@ -67,9 +55,6 @@ pub fn make_folder(path: &Path) -> std::io::Result<()> {
 }
 
 /// Removes a folder atomically: renames it first, then deletes it.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn remove_folder(path: &Path) -> std::io::Result<()> {
     let doomed = path.with_extension("tmp");
     if doomed.exists() {
@@ -81,9 +66,6 @@ pub fn remove_folder(path: &Path) -> std::io::Result<()> {
 
 /// Removes the temporary files and folders that killed processes left in `folder` and below it. No other process may
 /// write there. A missing folder is not an error.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
     let items = match std::fs::read_dir(folder) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),

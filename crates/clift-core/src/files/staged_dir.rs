@@ -23,9 +23,6 @@ pub struct StagedDir {
 
 impl StagedDir {
     /// Creates `out` if missing, and removes what killed processes left in it. No other process may write there.
-    ///
-    /// # Errors
-    /// Errors of the operating system.
     pub fn new(out: &Path) -> std::io::Result<Self> {
         let is_new = !out.exists();
         std::fs::create_dir_all(out)?;
@@ -45,9 +42,6 @@ impl StagedDir {
     }
 
     /// Moves the files to the output folder, where they replace files of equal names. Returns the names.
-    ///
-    /// # Errors
-    /// Errors of the operating system.
     pub fn commit(mut self) -> std::io::Result<BTreeSet<OsString>> {
         let items = std::fs::read_dir(self.path())?;
         let names = items.map(|item| Ok(item?.file_name())).collect::<std::io::Result<BTreeSet<OsString>>>()?;
@@ -71,9 +65,6 @@ impl Drop for StagedDir {
 }
 
 /// Returns whether a folder is missing or holds only temporary folders of killed processes.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn is_empty_folder(folder: &Path) -> std::io::Result<bool> {
     let items = match std::fs::read_dir(folder) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(true),

@@ -104,9 +104,6 @@ impl PoseNormalization {
 }
 
 /// Checks that a normalised camera is within [`MAX_COORDINATE`] of the origin.
-///
-/// # Errors
-/// [`CameraError::BadCamera`].
 pub fn check_near(pose: &Pose) -> Result<(), CameraError> {
     let coordinate = pose.translation.abs().max_element();
     if coordinate <= MAX_COORDINATE {

@@ -43,9 +43,6 @@ impl Pose {
     }
 
     /// Checks that all numbers are finite and that the rotation is orthonormal up to 1e-2 and does not mirror.
-    ///
-    /// # Errors
-    /// [`CameraError::BadCamera`].
     pub fn validate(self) -> Result<(), CameraError> {
         self.check_finite()?;
         let defect = self.orthonormality_defect();
@@ -62,9 +59,6 @@ impl Pose {
 
     /// Converts the upper three rows of a camera-to-world matrix with OpenGL camera axes (+x right, +y up, -z forward),
     /// as in nerfstudio's `transforms.json`: `rows * diag(1, -1, -1, 1)`. World axes and camera centre do not change.
-    ///
-    /// # Errors
-    /// As [`Pose::from_rows`].
     pub fn from_opengl(rows: &[[f64; 4]; 3]) -> Result<Self, CameraError> {
         let Self { rotation, translation } = Self::from_rows(rows)?;
         Ok(Self { rotation: DMat3::from_cols(rotation.x_axis, -rotation.y_axis, -rotation.z_axis), translation })

@@ -134,9 +134,6 @@ pub(crate) fn has_alpha(path: &Path) -> bool {
 }
 
 /// Returns the columns and rows of a JPEG or PNG file, as stored.
-///
-/// # Errors
-/// [`DataError::Io`] and [`DataError::BadScene`] for a file that cannot be read or has another format.
 pub fn image_size(path: &Path) -> Result<[usize; 2], DataError> {
     read_header(path).map(|(size, _)| size)
 }
@@ -225,9 +222,6 @@ pub fn encode_jpeg(image: &RgbImage, quality: u8) -> Result<Vec<u8>, DataError> 
 }
 
 /// Encodes an image as PNG (lossless).
-///
-/// # Errors
-/// As [`encode_jpeg`].
 pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     encode(PngEncoder::new(&mut bytes), image)?;

@@ -27,9 +27,6 @@ pub struct DatasetRoot {
 
 impl DatasetRoot {
     /// Finds a data set and its split folders.
-    ///
-    /// # Errors
-    /// [`DataError::Io`] for a path that does not exist.
     pub fn find(path: &Path) -> Result<Self, DataError> {
         std::fs::metadata(path).map_err(DataError::io("opening the data", path))?;
         Ok(Self { path: path.to_owned(), has_splits: has_splits(path) })

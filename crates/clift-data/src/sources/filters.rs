@@ -17,9 +17,6 @@ pub struct SceneFilters {
 
 impl SceneFilters {
     /// Checks every field.
-    ///
-    /// # Errors
-    /// The invalid field.
     pub fn validate(&self) -> Result<(), BadConfig> {
         let Some(limit) = self.max_fov_deg else { return Ok(()) };
         check_config(limit.is_finite() && limit > 0.0, "max_fov_deg", limit, || {

@@ -66,9 +66,6 @@ pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) ->
 
 /// Opens a data set as [`open_source`] does. `progress` is called while its chunks are examined for the filters: the first
 /// opening of a large data set reads every chunk and can take minutes.
-///
-/// # Errors
-/// As [`open_source`].
 pub(crate) fn scan_source(
     root: &DatasetRoot,
     split: Split,

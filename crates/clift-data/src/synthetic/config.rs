@@ -97,9 +97,6 @@ impl Default for SyntheticConfig {
 
 impl SyntheticConfig {
     /// Checks every field.
-    ///
-    /// # Errors
-    /// The first field out of range.
     pub fn validate(&self) -> Result<(), BadConfig> {
         for (key, count, most) in [
             ("num_scenes", self.num_scenes, MAX_SCENES),

@@ -43,9 +43,6 @@ enum Scene {
 
 impl SyntheticSource {
     /// Creates a source without rendering any frame.
-    ///
-    /// # Errors
-    /// As [`SyntheticConfig::validate`].
     pub fn new(config: SyntheticConfig) -> Result<Self, DataError> {
         config.validate()?;
         let num_blocks = config.num_scenes.div_ceil(KEYS_PER_BLOCK);

@@ -35,9 +35,6 @@ impl ImageEncoding {
 
 /// Reads a scene, its frames on all cores. Image files are copied; other frames, and images with a side above `max_size`
 /// pixels after their reduction, are encoded. Returns the scene and the number of encoded frames.
-///
-/// # Errors
-/// The errors of reading and encoding.
 pub fn read_scene(
     source: &dyn SceneSource,
     scene: usize,

@@ -33,9 +33,6 @@ pub struct SourceInfo {
 
 impl SourceInfo {
     /// Reads the cameras of every scene and the size of a frame, on all cores.
-    ///
-    /// # Errors
-    /// The error of the first scene if no scene can be read.
     pub fn read(source: &dyn SceneSource) -> Result<Self, DataError> {
         let every = source.num_scenes().div_ceil(MAX_SIZED_SCENES).max(1);
         let read = (0..source.num_scenes()).into_par_iter().map(|scene| {

@@ -4,13 +4,11 @@
 //! - `index_statistics`: statistics of an evaluation index
 //! - `overlap_index`: make an evaluation index
 //! - `export`: write a source as chunks
-//! - `convert`: convert any layout, resumable
-//! - `checksums`: `SHA256SUMS` of a conversion in progress
+//! - `convert`: convert any layout
 //! - `features`: corners, matches and epipolar geometry
 //! - `check`: images, cameras, and poses against the images
 
 pub(crate) mod check;
-pub(crate) mod checksums;
 pub(crate) mod convert;
 pub(crate) mod export;
 pub(crate) mod features;

@@ -50,9 +50,6 @@ impl Default for OverlapOptions {
 
 impl OverlapOptions {
     /// Checks every field.
-    ///
-    /// # Errors
-    /// The first invalid field.
     pub fn validate(&self) -> Result<(), BadConfig> {
         let Self { num_context, num_targets, distance: [near, far], min_overlap, .. } = *self;
         check_config((2..=10_000).contains(&num_context), "num_context", num_context, || "use 2 or more".into())?;

@@ -95,9 +95,6 @@ pub struct MethodName(ArrayString<{ MAX_NAME * MAX_CHAR_BYTES }>);
 
 impl MethodName {
     /// Checks a name: 1 to 40 printable characters, not the name of an own method.
-    ///
-    /// # Errors
-    /// [`EvalError::BadMethodName`].
     pub fn new(name: &str) -> Result<Self, EvalError> {
         let bad = |reason: &str| EvalError::BadMethodName { name: name.into(), reason: reason.into() };
         if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {

@@ -21,7 +21,6 @@ use crate::report::page::{MAX_FIGURES, Report, RunDescription};
 use crate::report::training::TrainingCurve;
 use crate::statistics::csv_files::{write_scenes, write_views};
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::scene_scores::SceneScores;
 use crate::statistics::summary::{Summary, context_targets_note};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
@@ -145,9 +144,7 @@ impl Evaluator {
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
         write_skip_report(&skipped, &folder.join("skipped.json"))?;
-        let scenes = SceneScores::new(&measured);
-        let report =
-            Report { run: self.description.clone(), summary: summary.clone(), training, scenes, skipped, figures };
+        let report = Report { run: self.description.clone(), summary: summary.clone(), training, skipped, figures };
         report.write(&folder.join("report.html"))?;
         summary.write(&complete)?;
         Ok(summary)
@@ -338,9 +335,6 @@ fn check_counts(eval: &EvalConfig, fewest_tokens: usize, architecture: Architect
 }
 
 /// Writes skipped scenes with their reasons as JSON.
-///
-/// # Errors
-/// [`EvalError::Io`].
 pub fn write_skip_report(skip_report: &SkipReport, path: &Path) -> Result<(), EvalError> {
     let text = serde_json::to_vec_pretty(skip_report).map_err(std::io::Error::from);
     text.and_then(|text| replace_file(path, &text)).map_err(EvalError::io("writing the skipped scenes", path))

@@ -26,9 +26,6 @@ pub trait EvalProgress {
     }
 
     /// Returns the results of all processes, by rank.
-    ///
-    /// # Errors
-    /// [`EvalError::OtherProcess`].
     fn gather(&mut self, own: SharedScenes) -> Result<Vec<SharedScenes>, EvalError> {
         Ok(vec![own])
     }

@@ -110,9 +110,6 @@ impl Canvas {
     }
 
     /// Writes the image as a PNG file, atomically.
-    ///
-    /// # Errors
-    /// [`EvalError::Io`] when the folder cannot be written.
     pub fn write_png(&self, path: &Path) -> Result<(), EvalError> {
         self.png().and_then(|png| replace_file(path, &png)).map_err(EvalError::io("writing the image", path))
     }

@@ -21,9 +21,6 @@ impl Video {
     /// Starts a video of `width` by `height` pixels at `fps` frames per second; `None` without `ffmpeg` on the PATH.
     ///
     /// A side with an odd number of pixels gets one black row or column more, which the format demands.
-    ///
-    /// # Errors
-    /// [`EvalError::Io`] if `ffmpeg` cannot be started.
     pub fn start(path: &Path, width: usize, height: usize, fps: u16) -> Result<Option<Self>, EvalError> {
         let temporary = path.with_file_name(format!("{TEMPORARY}{}.mp4", std::process::id()));
         let mut command = Command::new("ffmpeg");

@@ -5,7 +5,6 @@
 //! - `plot`: SVG plots
 //! - `plots`: plots of a summary
 //! - `training`: training curves
-//! - `scene_list`: the distribution over scenes
 //! - `scene_section`: one scene on the page
 //! - `tables`: tables of the page
 //! - `page`: the HTML page
@@ -15,7 +14,6 @@ pub(crate) mod html;
 pub(crate) mod page;
 pub(crate) mod plot;
 pub(crate) mod plots;
-pub(crate) mod scene_list;
 pub(crate) mod scene_section;
 pub(crate) mod tables;
 pub(crate) mod training;

@@ -10,13 +10,11 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::error::EvalError;
 use crate::figures::scene_figure::SceneFigure;
-use crate::report::axis::{grouped, milliseconds};
-use crate::report::html::{count, number, text};
+use crate::report::html::text;
 use crate::report::plots::plots;
 use crate::report::training::{self, TrainingCurve};
-use crate::report::{scene_list, scene_section, tables};
-use crate::statistics::scene_scores::SceneScores;
-use crate::statistics::summary::{Summary, SummaryPoint};
+use crate::report::{scene_section, tables};
+use crate::statistics::summary::Summary;
 
 const STYLE: &str = include_str!("style.css");
 
@@ -54,8 +52,6 @@ pub struct Report {
     pub summary: Summary,
     /// Training curves of the run, by stage; may be empty.
     pub training: Vec<TrainingCurve>,
-    /// The scenes from worst to best.
-    pub scenes: SceneScores,
     /// Skipped scenes with their reasons.
     pub skipped: SkipReport,
     /// Figures of scenes; the report has the first [`MAX_FIGURES`].
@@ -88,11 +84,9 @@ impl Report {
                             @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
                         }
                         @for warning in self.summary.warnings() { p.warning { "Warning: " (text(&warning)) } }
-                        (self.headline())
                         (self.quality_and_cost())
                         (tables::points(&self.summary))
                         (tables::differences(&self.summary.differences))
-                        (scene_list::section(&self.scenes))
                         (self.figures()?)
                         (training::section(&self.training))
                         (tables::skipped(self.summary.num_scenes, &self.skipped))
@@ -106,47 +100,6 @@ impl Report {
         };
         // HTML cannot express other control characters.
         Ok(page.into_string().replace(|c: char| c.is_control() && !matches!(c, '\n' | '\t'), "\u{fffd}"))
-    }
-
-    fn headline(&self) -> Markup {
-        let Summary { num_scenes, num_views, baselines, .. } = &self.summary;
-        let whole: Vec<&SummaryPoint> = self.summary.best_points().filter(|point| point.key.is_whole()).collect();
-        let (first, last) = (whole.first(), whole.last());
-        let tokens = |point: &SummaryPoint| format!("{} tokens", count(point.key.num_storage_tokens));
-        let nearest = baselines.nearest_view.psnr;
-        html! {
-            @if let (Some(first), Some(last)) = (first, last) {
-                p.lead {
-                    (first.key.method.name()) " reaches " (psnr_at(first))
-                    @if first != last { " and " (psnr_at(last)) }
-                    "."
-                    @if let Some(gain) = last.quality.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
-                        (if first == last { " This is " } else { " The latter is " }) (grouped(gain.abs(), 2)) " dB "
-                        (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view"
-                        @if baselines.nearest_view.num_identical_views > 0 {
-                            ", which is the target itself for " (count(baselines.nearest_view.num_identical_views))
-                            " of " (count(*num_views)) " views"
-                        }
-                        "."
-                    }
-                }
-            }
-            dl.tiles {
-                @for point in first.into_iter().chain(last.filter(|_| whole.len() > 1)) {
-                    @let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
-                    (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.quality.psnr, 2), "dB", &error))
-                }
-                (tile("nearest view", &number(nearest, 2), "dB", &copies(baselines.nearest_view.num_identical_views)))
-                @if let Some((point, (kb, format))) = first.and_then(|point| Some((point, scene_file(point)?))) {
-                    (tile("a scene file", &grouped(kb, 1), "kB", &format!("{}, {format}", tokens(point))))
-                }
-                @if let Some((point, seconds)) = last.and_then(|point| Some((point, point.frame_median_s?))) {
-                    (tile("a frame", &milliseconds(seconds), "ms", &tokens(point)))
-                }
-                @let scenes = format!("of {}", count(self.skipped.num_scenes.max(*num_scenes)));
-                (tile("scenes evaluated", &count(*num_scenes), &scenes, &format!("{} views", count(*num_views))))
-            }
-        }
     }
 
     fn quality_and_cost(&self) -> Markup {
@@ -191,29 +144,6 @@ impl Report {
             }
         })
     }
-}
-
-/// Returns the size of a scene file in kB, as `clift encode` writes it where the model has a codec, and its format.
-fn scene_file(point: &SummaryPoint) -> Option<(f64, String)> {
-    let evaluated = || Some((point.cost.scene_kb()?, point.key.tokens?.to_string()));
-    point.cost.coded_bytes.map(|bytes| (bytes as f64 / 1e3, "coded".into())).or_else(evaluated)
-}
-
-fn psnr_at(point: &SummaryPoint) -> Markup {
-    html! { strong { (number(point.quality.psnr, 2)) " dB" } " with " (count(point.key.num_storage_tokens)) " stored tokens" }
-}
-
-/// Returns the note on the baseline of copied context views.
-fn copies(num_identical: usize) -> String {
-    if num_identical == 0 {
-        "a copy, no model".into()
-    } else {
-        format!("{} of the target itself", count(num_identical))
-    }
-}
-
-fn tile(name: &str, value: &str, unit: &str, more: &str) -> Markup {
-    html! { div { dt { (name) } dd { (value) " " small { (unit) } } dd { (more) } } }
 }
 
 #[cfg(test)]

@@ -6,9 +6,7 @@
 //! - `pareto`: Pareto front
 //! - `metric_difference`: paired differences of views, with confidence intervals
 //! - `paired`: paired differences of methods
-//! - `scene_scores`: scenes from worst to best
 //! - `summary`: summary.json
-//! - `headline`: the result in a few lines
 //! - `csv_files`: views.csv and scenes.csv
 //! - `text_table`: aligned columns
 //! - `table`: the terminal table
@@ -19,11 +17,9 @@ pub(crate) mod compare;
 pub(crate) mod compare_table;
 pub(crate) mod csv_files;
 pub(crate) mod eval_results;
-pub(crate) mod headline;
 pub(crate) mod metric_difference;
 pub(crate) mod paired;
 pub(crate) mod pareto;
-pub(crate) mod scene_scores;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;

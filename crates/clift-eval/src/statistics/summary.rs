@@ -204,9 +204,6 @@ impl Summary {
     }
 
     /// Writes `summary.json`.
-    ///
-    /// # Errors
-    /// [`EvalError::Io`] when the folder cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), EvalError> {
         serde_json::to_vec_pretty(self)
             .map_err(std::io::Error::from)

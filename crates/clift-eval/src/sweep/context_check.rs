@@ -1,7 +1,7 @@
 //! Renders the context views themselves: contexts too far apart for a model come out as fog.
 
 use clift_data::Clip;
-use clift_model::{Clusters, SceneClusters, Views, psnr};
+use clift_model::{Clusters, ModelError, SceneClusters, Views, psnr};
 use clift_scene::{CheckedView, mean_image, view_image};
 
 use crate::error::EvalError;
@@ -17,7 +17,7 @@ pub(crate) fn check_contexts(models: &EvalModels, context: &Views, clip: &Clip) 
         tokens = model.network.compress(tokens, &alone.upload(&model.device));
     }
     let images = model.network.render(tokens, &context.cameras); // [1, V, H, W, 3]
-    let pixels: Vec<f32> = images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
+    let pixels: Vec<f32> = images.into_data().convert::<f32>().try_to_vec().map_err(ModelError::device)?;
     let mean = mean_image(&clip.context)?;
     let mut check = ContextCheck { num_views: clip.context.num_views(), num_fog: 0 };
     for (view, (pixels, &frame)) in pixels.chunks_exact(mean.len()).zip(&clip.context.frame_index).enumerate() {

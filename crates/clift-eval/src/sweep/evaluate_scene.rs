@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use clift_core::{derive_seed, median};
 use clift_data::Clip;
-use clift_model::{Cameras, FlopConvention, Grouping, Tokens, TrainedModel, Views};
+use clift_model::{Cameras, FlopConvention, Grouping, ModelError, Tokens, TrainedModel, Views};
 use clift_scene::{CodedLoss, TokenCoding};
 
 use crate::config::method::Method;
@@ -239,14 +239,14 @@ impl TargetRenderer<'_> {
             None => job.tokens.clone(),
         };
         let image = job.model.network.render(tokens, &camera_of(&self.cameras, view)); // [1, 1, H, W, 3]
-        image.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+        Ok(image.into_data().convert::<f32>().try_to_vec().map_err(ModelError::device)?)
     }
 
     /// Renders one untimed view of a key that has no cost yet: one-time work of the device, and the peak memory.
     fn warm_up(&self, job: &RenderJob, metrics: &mut EvalResults) -> Result<(), EvalError> {
         let Entry::Vacant(cost) = metrics.costs.entry(job.key) else { return Ok(()) };
         // Queued work must not count as rendering.
-        job.tokens.values.device().sync().map_err(EvalError::tensor)?;
+        job.tokens.values.device().sync().map_err(ModelError::device)?;
         let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
         self.render_view(job, 0)?;
         let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
@@ -270,7 +270,7 @@ impl TargetRenderer<'_> {
         let mut scored: Vec<ScoredViews> = jobs.iter().map(|job| ScoredViews::new(job.key)).collect();
         let mut seconds = vec![vec![Vec::new(); jobs.len()]; num_views];
         if let Some(job) = jobs.first() {
-            job.tokens.values.device().sync().map_err(EvalError::tensor)?;
+            job.tokens.values.device().sync().map_err(ModelError::device)?;
         }
         let missing = self.sweep.min_timed_views.saturating_sub(num_timed);
         let num_rounds = missing.div_ceil(num_views.max(1)).max(1);

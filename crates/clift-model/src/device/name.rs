@@ -77,9 +77,6 @@ impl DeviceName {
 
     /// Opens the device of the `index`-th of several processes on a host, and returns the name of its adapter: on wgpu the
     /// adapters of the first kind in turn, unless the environment variable selects one.
-    ///
-    /// # Errors
-    /// As [`DeviceName::open`].
     pub fn open_nth(self, index: usize) -> Result<(Device, Option<String>), ModelError> {
         match self {
             Self::Flex | Self::Ndarray => Ok((self.open()?, None)),

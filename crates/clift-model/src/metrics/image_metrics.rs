@@ -108,9 +108,6 @@ fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64>
 ///
 /// The gradient is that of the luminance (0.2125 R + 0.7154 G + 0.0721 B) after clamping to [0, 1], by forward differences to
 /// the right and downward. The mean leaves out the last row and column, and is weighted by `weights`, one per pixel.
-///
-/// # Errors
-/// [`ModelError::BadImage`].
 pub fn sharpness(
     pred: &[f32],
     target: &[f32],
@@ -141,9 +138,6 @@ fn mean_gradient(image: &[f32], width: usize, weights: Option<&[u8]>) -> f64 {
 }
 
 /// Refuses images of another size than `expected` values, NaN and infinity.
-///
-/// # Errors
-/// [`ModelError::BadImage`].
 pub fn check_images(pred: &[f32], target: &[f32], expected: usize) -> Result<(), ModelError> {
     for (image, name) in [(target, "target"), (pred, "prediction")] {
         if image.len() != expected || image.is_empty() {

@@ -102,9 +102,6 @@ impl Lpips {
     }
 
     /// Returns the distance of two images, `[height, width, 3]`.
-    ///
-    /// # Errors
-    /// As [`Lpips::features`].
     pub fn measure(&self, pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, ModelError> {
         self.distance(&self.features(pred, height, width)?, &self.features(target, height, width)?)
     }

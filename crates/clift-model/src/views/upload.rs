@@ -82,9 +82,6 @@ impl Views {
     ///
     /// # Shapes
     /// - `scenes`: as [`Cameras::upload`]
-    ///
-    /// # Errors
-    /// As [`Cameras::upload`] and [`upload_images`].
     pub fn upload(scenes: &[&ClipViews], device: &Device) -> Result<Self, ModelError> {
         Ok(Self { images: upload_images(scenes, device)?, cameras: Cameras::upload(scenes, device)? })
     }
@@ -95,9 +92,6 @@ impl Views {
 /// # Shapes
 /// - `scenes`: sets of the same number of views of the same size
 /// - returns `[batch, views, height, width, 3]`
-///
-/// # Errors
-/// [`ModelError::WrongLength`].
 pub fn upload_images(scenes: &[&ClipViews], device: &Device) -> Result<Tensor<5>, ModelError> {
     let [batch, views, height, width] = shape(scenes);
     let images = scenes.iter().map(|views| &views.images[..]).collect::<Vec<_>>().concat();

@@ -51,17 +51,11 @@ impl LoadReport {
 
 /// Writes the parameters of a module with PyTorch's names and layout (linear weights `[outputs, inputs]`). Equal weights
 /// are equal files, and a file under its final name is complete.
-///
-/// # Errors
-/// [`ModelError::Weights`].
 pub fn save_weights<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
     save_part(module, &PathFilter::all(), path)
 }
 
 /// Writes the parameters whose paths match `part`, as [`save_weights`].
-///
-/// # Errors
-/// As [`save_weights`].
 pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Result<(), ModelError> {
     write(module, part, BurnToPyTorchAdapter, path)
 }

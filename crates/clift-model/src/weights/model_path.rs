@@ -52,9 +52,6 @@ impl ModelPath {
 
     /// Returns the weight file that renders tokens of a kind: that of stage 1 or 2 of a run directory, that of a model
     /// directory, or `path` itself if `path` is not a directory. The file need not exist.
-    ///
-    /// # Errors
-    /// Those of [`find_shipped`](crate::find_shipped).
     pub fn for_tokens(path: &Path, kind: TokenKind) -> Result<PathBuf, ModelError> {
         let path = &*find_shipped(path)?;
         let inside = path.join(WEIGHTS);
@@ -85,9 +82,6 @@ fn weights_of(run: &Path, kind: TokenKind) -> PathBuf {
 }
 
 /// Returns an error for a PyTorch checkpoint, recognised by its extension or as a ZIP archive.
-///
-/// # Errors
-/// [`ModelError::NotImported`].
 pub fn refuse_checkpoint(path: &Path) -> Result<(), ModelError> {
     if !path.is_file() {
         return Ok(());
@@ -127,9 +121,6 @@ pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
 }
 
 /// Checks what tensor shapes do not determine in the condenser, for weights with a trained one.
-///
-/// # Errors
-/// As [`check_sizes`].
 pub fn check_condenser(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
     check_equal(model, dir, |config| vec![("model.condenser.member_share", config.condenser.member_share.to_string())])
 }

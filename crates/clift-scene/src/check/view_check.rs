@@ -28,9 +28,6 @@ pub struct CheckedView {
 
 impl CheckedView {
     /// Compares renderings of `views` with copies of the nearest of the `context` views.
-    ///
-    /// # Errors
-    /// The errors of rendering.
     pub fn others(
         renderer: &mut SceneRenderer,
         views: &ClipViews,
@@ -40,9 +37,6 @@ impl CheckedView {
     }
 
     /// Compares renderings of the context views with the mean of their images.
-    ///
-    /// # Errors
-    /// The errors of rendering.
     pub fn contexts(renderer: &mut SceneRenderer, context: &ClipViews) -> Result<Vec<Self>, SceneError> {
         let mean = mean_image(context)?;
         Self::compare(renderer, context, |_| Ok(mean.clone()))

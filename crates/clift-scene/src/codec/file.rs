@@ -57,9 +57,6 @@ impl TokenCodec {
     }
 
     /// Writes the codec.
-    ///
-    /// # Errors
-    /// [`ModelError::CodecFile`].
     pub fn write(&self, path: &Path) -> Result<(), ModelError> {
         let written = to_bytes(self).and_then(|bytes| replace_file(path, &bytes).map_err(|error| error.to_string()));
         written.map_err(|reason| ModelError::CodecFile { action: "writing", reason, path: path.into() })

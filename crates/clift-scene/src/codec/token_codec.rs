@@ -101,9 +101,6 @@ impl TokenCodec {
     }
 
     /// Returns the bits of tokens `[S, D]` in a stream of their own, and counts their levels.
-    ///
-    /// # Errors
-    /// As [`round`](Self::round).
     pub fn count_bits(
         &self,
         tokens: &[f32],
@@ -121,9 +118,6 @@ impl TokenCodec {
     }
 
     /// Encodes tokens `[S, D]` and their places, in the order of ids.
-    ///
-    /// # Errors
-    /// As [`round`](Self::round).
     pub fn encode(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<Vec<u32>, ModelError> {
         let (levels, neighbours) = self.quantize(tokens, places, step)?;
         let mut ids = places.ids.to_vec();

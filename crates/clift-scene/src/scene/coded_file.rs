@@ -88,9 +88,6 @@ impl Scene {
     }
 
     /// Writes the scene with coded tokens, as [`write`](Self::write) writes plain ones.
-    ///
-    /// # Errors
-    /// As [`coded_bytes`](Self::coded_bytes) and [`write`](Self::write).
     pub fn write_coded(&self, path: &Path, codec: &TokenCodec, step: f32) -> Result<(), ModelError> {
         let refuse = |reason, fix| ModelError::SceneFile { action: "write", reason, fix, path: path.into() };
         self.check().map_err(|reason| refuse(reason, "encode other views or fewer tokens"))?;

@@ -70,9 +70,6 @@ pub(crate) struct FramePlan {
 
 impl FramePlan {
     /// Plans a frame of `[height, width]` pixels.
-    ///
-    /// # Errors
-    /// As [`check_frames`].
     pub fn new(trained: TrainedImage, view: &Camera, [height, width]: [usize; 2]) -> Result<Self, ModelError> {
         let intrinsics = view.intrinsics.to_array();
         if let Some(position) = intrinsics.iter().position(|value| !value.is_finite()) {

@@ -37,9 +37,6 @@ impl Scene {
     }
 
     /// Reads a scene file with the codec of `model` in place of that of the scene's model path.
-    ///
-    /// # Errors
-    /// As [`read`](Self::read).
     pub fn read_for(path: &Path, model: Option<&Path>) -> Result<(Self, TokenCoding), ModelError> {
         let read = || {
             let size = std::fs::metadata(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?.len();

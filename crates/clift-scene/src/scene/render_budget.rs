@@ -25,9 +25,6 @@ pub struct RenderBudget {
 
 impl RenderBudget {
     /// Measures the time per frame for a few token counts.
-    ///
-    /// # Errors
-    /// As [`SceneRenderer::render`].
     pub fn measure(
         renderer: &mut SceneRenderer,
         view: &Camera,

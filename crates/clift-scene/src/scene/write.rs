@@ -13,9 +13,6 @@ use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;
 
 /// Checks that a scene can be written to a path without loss: the folder exists, and the path is free or a scene file.
-///
-/// # Errors
-/// [`ModelError::SceneFile`].
 pub fn check_output_path(path: &Path) -> Result<(), ModelError> {
     let refuse = |reason: &str, fix| {
         Err(ModelError::SceneFile { action: "write", reason: reason.to_owned(), fix, path: path.into() })

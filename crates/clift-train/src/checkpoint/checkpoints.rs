@@ -98,9 +98,6 @@ impl Checkpoints {
     }
 
     /// Loads the newest checkpoint into `train_state`. Returns `None` without a checkpoint.
-    ///
-    /// # Errors
-    /// As [`load`](Self::load).
     pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<TrainingPosition>, TrainError> {
         let Some(step) = self.newest_step()? else { return Ok(None) };
         // Each save removes unfinished saves, but a finished stage makes no further save.
@@ -138,26 +135,17 @@ impl Checkpoints {
     }
 
     /// Returns `model` with the weights of the checkpoint of a step, without reading the optimizer. Changes no file.
-    ///
-    /// # Errors
-    /// As [`load`](Self::load).
     pub fn load_model(&self, step: u64, model: Network) -> Result<Network, TrainError> {
         let path = self.path_of(step);
         apply_model(&verify(&path)?, &path, self.model.as_ref(), model)
     }
 
     /// Returns the path of the newest checkpoint.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn newest(&self) -> Result<Option<PathBuf>, TrainError> {
         Ok(self.newest_step()?.map(|step| self.path_of(step)))
     }
 
     /// Returns the step of the newest checkpoint.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn newest_step(&self) -> Result<Option<u64>, TrainError> {
         Ok(self.steps()?.pop())
     }

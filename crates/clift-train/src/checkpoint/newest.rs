@@ -24,9 +24,6 @@ pub struct NewestCheckpoint {
 impl NewestCheckpoint {
     /// Finds the checkpoint; `None` for a finished stage 2, a finished stage 1 without a checkpoint of stage 2, and for a folder
     /// that is not a run.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn find(run: &Path) -> Result<Option<Self>, TrainError> {
         if !run.join("run.json").is_file() {
             return Ok(None);
@@ -44,9 +41,6 @@ impl NewestCheckpoint {
     }
 
     /// Reads the model, with a trained condenser in stage 2.
-    ///
-    /// # Errors
-    /// As [`Checkpoints::load`].
     pub fn open(&self, config: &Config, run: &Path, device: &Device) -> Result<TrainedModel, TrainError> {
         let initial = Network::new(&config.model, config.seed, device);
         let checkpoints = checkpoints(run, self.stage).with_model(config.model.clone());

@@ -1,11 +1,10 @@
 //! Log of the finished entries of a cluster cache, from which an interrupted build resumes.
 //!
-//! Every context set is a line of `journal.jsonl`, written after its bytes in `clusters.bin` and with a checksum of both.
-//! Torn entries are found by their checksums and built again.
+//! Every context set is a line of `journal.jsonl`; a torn line is made again. The finished cache is written from them.
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
+use std::io::{BufRead, BufReader, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use clift_core::{make_folder, publish_folder, replace_file};
@@ -33,28 +32,10 @@ pub(crate) struct CacheKey {
 
 /// A further line: the outcome of a context set.
 #[derive(Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Line {
-    set: u64,
-    outcome: Outcome,
-    /// Checksum of index, outcome and bytes of the set.
-    crc32: u32,
-}
-
-#[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 enum Outcome {
-    Clustered(CacheEntry),
+    Clustered { key: String, context: Vec<usize>, tokens: Vec<u16>, centroids: Vec<u16> },
     Skipped { key: String, reason: String },
-}
-
-impl Line {
-    fn new(set: u64, outcome: Outcome, bytes: &[u8]) -> serde_json::Result<Self> {
-        let mut hasher = crc32fast::Hasher::new();
-        hasher.update(&serde_json::to_vec(&(set, &outcome))?);
-        hasher.update(bytes);
-        Ok(Self { set, outcome, crc32: hasher.finalize() })
-    }
 }
 
 /// A cluster cache during its build.
@@ -62,114 +43,62 @@ impl Line {
 pub(crate) struct ResumeLog {
     folder: PathBuf,
     cache_key: CacheKey,
-    data: File,
-    lines: File,
-    entries: Vec<CacheEntry>,
-    skipped: Vec<(String, String)>,
+    journal: File,
+    num_sets: u64,
 }
 
 impl ResumeLog {
     /// Resumes the build in `folder`, or starts a new one if the folder has no log of `cache_key`.
     pub fn open(folder: &Path, cache_key: CacheKey) -> Result<Self, TrainError> {
-        let failed = |source| TrainError::io("resuming an unfinished cluster cache", folder)(source);
-        if let Some(log) = Self::resume(folder, &cache_key).map_err(failed)? {
-            return Ok(log);
+        let failed = TrainError::io("resuming an unfinished cluster cache", folder);
+        if let Some((journal, num_sets)) = resume(folder, &cache_key).map_err(failed)? {
+            return Ok(Self { folder: folder.into(), cache_key, journal, num_sets });
         }
         if folder.exists() {
             std::fs::remove_dir_all(folder).map_err(TrainError::io("removing an unfinished cache", folder))?;
         }
         make_folder(folder).map_err(TrainError::io("making the cluster cache", folder))?;
-        let create = |name: &str| File::create(folder.join(name)).map_err(TrainError::io(WRITING, &folder.join(name)));
-        let (data, lines) = (create(DATA)?, create(JOURNAL)?);
-        let mut log = Self { folder: folder.into(), cache_key, data, lines, entries: Vec::new(), skipped: Vec::new() };
+        let path = folder.join(JOURNAL);
+        let journal = File::create(&path).map_err(TrainError::io(WRITING, &path))?;
+        let mut log = Self { folder: folder.into(), cache_key, journal, num_sets: 0 };
         log.write_line(&log.cache_key.clone())?;
         Ok(log)
     }
 
-    /// Reads the finished sets of an earlier process and removes an unfinished one.
-    fn resume(folder: &Path, cache_key: &CacheKey) -> std::io::Result<Option<Self>> {
-        let open = |name: &str| File::options().read(true).write(true).open(folder.join(name));
-        let (Ok(mut data), Ok(mut lines)) = (open(DATA), open(JOURNAL)) else { return Ok(None) };
-        let (mut entries, mut skipped) = (Vec::new(), Vec::new());
-        let (mut num_bytes, mut num_line_bytes) = (0, 0);
-        let mut reader = BufReader::new(&lines);
-        let mut text = Vec::new();
-        reader.read_until(b'\n', &mut text)?;
-        if !serde_json::from_slice::<CacheKey>(&text).is_ok_and(|found| found == *cache_key && text.ends_with(b"\n")) {
-            return Ok(None);
-        }
-        loop {
-            num_line_bytes += text.len() as u64;
-            text.clear();
-            reader.read_until(b'\n', &mut text)?;
-            if !text.ends_with(b"\n") {
-                break;
-            }
-            let Ok(Line { set, outcome, crc32 }) = serde_json::from_slice(&text) else { break };
-            let mut bytes = Vec::new();
-            if let Outcome::Clustered(entry) = &outcome {
-                Read::by_ref(&mut data).take(entry.num_bytes()).read_to_end(&mut bytes)?;
-            }
-            let expected = Line::new((entries.len() + skipped.len()) as u64, outcome, &bytes)?;
-            if (set, crc32) != (expected.set, expected.crc32) {
-                break;
-            }
-            match expected.outcome {
-                Outcome::Clustered(entry) => {
-                    num_bytes += entry.num_bytes();
-                    entries.push(entry);
-                }
-                Outcome::Skipped { key, reason } => skipped.push((key, reason)),
-            }
-        }
-        drop(reader);
-        for (file, length) in [(&mut data, num_bytes), (&mut lines, num_line_bytes)] {
-            file.set_len(length)?;
-            file.seek(SeekFrom::Start(length))?;
-        }
-        Ok(Some(Self { folder: folder.into(), cache_key: cache_key.clone(), data, lines, entries, skipped }))
-    }
-
     pub fn num_sets(&self) -> u64 {
-        (self.entries.len() + self.skipped.len()) as u64
+        self.num_sets
     }
 
     pub fn add(&mut self, key: &str, context: Vec<usize>, clusters: &SceneClusters) -> Result<(), TrainError> {
-        let bytes = encode_clusters(clusters)?;
-        let entry = CacheEntry {
-            key: key.into(),
-            context,
-            num_tokens: clusters.assignment().len(),
-            num_storage_tokens: clusters.centroid_index().len(),
-            offset_bytes: self.entries.last().map_or(0, |last| last.offset_bytes + last.num_bytes()),
+        let short = |ids: &[u32]| ids.iter().map(|&id| u16::try_from(id)).collect::<Result<Vec<u16>, _>>();
+        let (Ok(tokens), Ok(centroids)) = (short(clusters.assignment()), short(clusters.centroid_index())) else {
+            return Err(TrainError::NoScenes { reason: format!("a scene has more than {MAX_TOKENS} tokens") });
         };
-        self.data.write_all(&bytes).map_err(TrainError::io(WRITING, &self.folder.join(DATA)))?;
-        self.write_outcome(Outcome::Clustered(entry.clone()), &bytes)?;
-        self.entries.push(entry);
-        Ok(())
+        self.write_outcome(&Outcome::Clustered { key: key.into(), context, tokens, centroids })
     }
 
     /// Logs that the next set could not be clustered.
     pub fn skip(&mut self, key: &str, reason: &str) -> Result<(), TrainError> {
-        self.write_outcome(Outcome::Skipped { key: key.into(), reason: reason.into() }, &[])?;
-        self.skipped.push((key.into(), reason.into()));
-        Ok(())
+        self.write_outcome(&Outcome::Skipped { key: key.into(), reason: reason.into() })
     }
 
-    fn write_outcome(&mut self, outcome: Outcome, bytes: &[u8]) -> Result<(), TrainError> {
-        let line = Line::new(self.num_sets(), outcome, bytes);
-        self.write_line(&line.map_err(TrainError::bad_file("cluster cache", &self.folder.join(JOURNAL)))?)
+    fn write_outcome(&mut self, outcome: &Outcome) -> Result<(), TrainError> {
+        self.write_line(outcome)?;
+        self.num_sets += 1;
+        Ok(())
     }
 
     fn write_line(&mut self, line: &impl Serialize) -> Result<(), TrainError> {
         let path = self.folder.join(JOURNAL);
         let text = serde_json::to_string(line).map_err(TrainError::bad_file("cluster cache", &path))?;
-        self.lines.write_all(format!("{text}\n").as_bytes()).map_err(TrainError::io(WRITING, &path))
+        self.journal.write_all(format!("{text}\n").as_bytes()).map_err(TrainError::io(WRITING, &path))
     }
 
-    /// Writes the index of the finished cache, renames the folder to `path`, and removes the log.
+    /// Writes the data and the index of the finished cache, renames the folder to `path`, and removes the log.
     pub fn publish(self, path: &Path, num_scenes: usize) -> Result<(), TrainError> {
-        let Self { folder, cache_key, data, lines, entries, skipped } = self;
+        let Self { folder, cache_key: CacheKey { version, encoder, settings }, .. } = self;
+        let data = folder.join(DATA);
+        let (entries, skipped) = write_data(&folder.join(JOURNAL), &data).map_err(TrainError::io(WRITING, &data))?;
         if entries.is_empty() {
             // A kept log would skip the same scenes again after their files are repaired.
             std::fs::remove_dir_all(&folder).map_err(TrainError::io("removing an empty cache", &folder))?;
@@ -185,15 +114,61 @@ impl ResumeLog {
         for (key, reason) in reasons {
             report.skip(key, reason);
         }
-        let CacheKey { version, encoder, settings } = cache_key;
         let index = CacheIndex { version, encoder, settings, skipped: report, entries };
         let index_path = folder.join("index.json");
         let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
         replace_file(&index_path, &text).map_err(TrainError::io(WRITING, &index_path))?;
-        drop((data, lines));
         publish_folder(&folder, path).map_err(TrainError::io("renaming the cluster cache", path))?;
         remove_resume_log(path)
     }
+}
+
+/// Counts the finished sets of an earlier process and removes an unfinished line. Returns the journal at its end, and `None`
+/// without a journal of `cache_key`.
+fn resume(folder: &Path, cache_key: &CacheKey) -> std::io::Result<Option<(File, u64)>> {
+    let Ok(mut journal) = File::options().read(true).write(true).open(folder.join(JOURNAL)) else { return Ok(None) };
+    let (mut reader, mut line, mut num_bytes, mut num_sets) = (BufReader::new(&journal), Vec::new(), 0, 0);
+    reader.read_until(b'\n', &mut line)?;
+    let is_whole = |line: &[u8]| line.ends_with(b"\n");
+    if !is_whole(&line) || serde_json::from_slice(&line).ok().as_ref() != Some(cache_key) {
+        return Ok(None);
+    }
+    loop {
+        num_bytes += line.len() as u64;
+        line.clear();
+        reader.read_until(b'\n', &mut line)?;
+        if !is_whole(&line) || serde_json::from_slice::<Outcome>(&line).is_err() {
+            break;
+        }
+        num_sets += 1;
+    }
+    journal.set_len(num_bytes)?;
+    journal.seek(SeekFrom::Start(num_bytes))?;
+    Ok(Some((journal, num_sets)))
+}
+
+/// The keys of skipped scenes, with reasons, in the order of the journal.
+type Skipped = Vec<(String, String)>;
+
+/// Writes the clusters of a journal to `data`. Returns their entries and what was skipped.
+fn write_data(journal: &Path, data: &Path) -> std::io::Result<(Vec<CacheEntry>, Skipped)> {
+    let (mut entries, mut skipped) = (Vec::<CacheEntry>::new(), Skipped::new());
+    let mut data = BufWriter::new(File::create(data)?);
+    for line in BufReader::new(File::open(journal)?).lines().skip(1) {
+        match serde_json::from_str(&line?)? {
+            Outcome::Skipped { key, reason } => skipped.push((key, reason)),
+            Outcome::Clustered { key, context, tokens, centroids } => {
+                for id in tokens.iter().chain(&centroids) {
+                    data.write_all(&id.to_le_bytes())?;
+                }
+                let offset_bytes = entries.last().map_or(0, |last| last.offset_bytes + last.num_bytes());
+                let (num_tokens, num_storage_tokens) = (tokens.len(), centroids.len());
+                entries.push(CacheEntry { key, context, num_tokens, num_storage_tokens, offset_bytes });
+            }
+        }
+    }
+    data.into_inner()?.sync_data()?;
+    Ok((entries, skipped))
 }
 
 /// Removes the log of a finished cache, which a killed process may have left.
@@ -207,19 +182,8 @@ pub(crate) fn remove_resume_log(cache: &Path) -> Result<(), TrainError> {
     }
 }
 
-fn encode_clusters(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
-    let ids = clusters.assignment().iter().chain(clusters.centroid_index());
-    ids.map(|&id| u16::try_from(id).map(u16::to_le_bytes))
-        .collect::<Result<Vec<_>, _>>()
-        .map(|pairs| pairs.concat())
-        .map_err(|_| TrainError::NoScenes { reason: format!("a scene has more than {MAX_TOKENS} tokens") })
-}
-
 #[cfg(test)]
 mod tests {
-    use clift_core::item_rng;
-    use rand::RngExt;
-
     use super::*;
     use crate::config::config::Config;
 
@@ -264,54 +228,20 @@ mod tests {
         let expected = finished(whole.path());
         let (place, folder) = new_build();
         add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 6);
-        let [data, lines] = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
+        let lines = std::fs::read(folder.join(JOURNAL)).unwrap();
         let mut taken_over = std::collections::BTreeSet::new();
         let ends = lines.iter().enumerate().filter(|(_, byte)| **byte == b'\n').flat_map(|(end, _)| [end, end + 1]);
         for length in ends.chain((0..lines.len()).step_by(97)) {
-            // The data of a line is written before it; a power cut may lose some all the same.
-            for data_length in [data.len(), data.len() * length / lines.len(), 0] {
+            // A power cut may leave zeros.
+            for torn in [&[][..], &[0; 40]] {
                 std::fs::create_dir_all(&folder).unwrap();
-                std::fs::write(folder.join(JOURNAL), &lines[..length]).unwrap();
-                std::fs::write(folder.join(DATA), &data[..data_length]).unwrap();
+                std::fs::write(folder.join(JOURNAL), [&lines[..length], torn].concat()).unwrap();
                 taken_over.insert(ResumeLog::open(&folder, cache_key()).unwrap().num_sets());
-                assert_eq!(finished(place.path()), expected, "{length}, {data_length}");
+                assert_eq!(finished(place.path()), expected, "{length}");
                 std::fs::remove_dir_all(place.path().join("clusters")).unwrap();
             }
         }
         assert!(taken_over.into_iter().eq(0..=6), "complete sets are not built again");
-    }
-
-    #[test]
-    fn sets_of_a_damaged_log_are_a_prefix() {
-        let (_place, folder) = new_build();
-        add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 6);
-        let files = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
-        let whole = ResumeLog::open(&folder, cache_key()).unwrap();
-        let mut taken_up = BTreeMap::new();
-        for case in 0..2_000 {
-            let mut rng = item_rng(0, 0, case, 0, "damage");
-            for (name, bytes) in [DATA, JOURNAL].into_iter().zip(&files) {
-                let mut bytes = bytes.clone();
-                for _ in 0..rng.random_range(0..3) {
-                    let at = rng.random_range(0..bytes.len());
-                    match rng.random_range(0..4) {
-                        0 => bytes[at] ^= 1 << rng.random_range(0..8),
-                        1 => bytes[at] = b"\n\",{}0"[rng.random_range(0..6)],
-                        2 => drop(bytes.drain(at..(at + rng.random_range(1..40)).min(bytes.len()))),
-                        _ => bytes.extend_from_within(at..),
-                    }
-                }
-                std::fs::create_dir_all(&folder).unwrap();
-                std::fs::write(folder.join(name), bytes).unwrap();
-            }
-            let log = ResumeLog::open(&folder, cache_key()).unwrap();
-            assert_eq!(log.entries, whole.entries[..log.entries.len()], "case {case}");
-            assert_eq!(log.skipped, whole.skipped[..log.skipped.len()], "case {case}");
-            let data = std::fs::read(folder.join(DATA)).unwrap();
-            assert_eq!(data, files[0][..data.len()], "case {case}");
-            *taken_up.entry(log.num_sets()).or_insert(0) += 1;
-        }
-        assert!(taken_up.keys().copied().eq(0..=6) && taken_up[&6] > 200, "{taken_up:?}");
     }
 
     #[test]

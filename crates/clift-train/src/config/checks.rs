@@ -10,9 +10,6 @@ use crate::events::Stage;
 
 impl Config {
     /// Checks ranges, and values that depend on each other.
-    ///
-    /// # Errors
-    /// [`TrainError::BadConfig`] with key, value and fix.
     pub fn validate(&self) -> Result<(), TrainError> {
         let has_run_dir = !self.run_dir.as_os_str().is_empty();
         check_config(has_run_dir, "run_dir", "\"\"", || "write the directory of the run".into())?;

@@ -21,15 +21,11 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Errors of a configuration.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the message of a variant says what its fields are")]
 pub enum ConfigError {
     /// The file could not be read.
     #[error("reading the configuration failed: {source}: {path}", path = path.display())]
-    Io {
-        /// Error of the operating system.
-        source: std::io::Error,
-        /// The file.
-        path: PathBuf,
-    },
+    Io { source: std::io::Error, path: PathBuf },
     /// A mistake in the file or an override, shown with its line: no TOML, an unknown or missing key, or a wrong value.
     #[error("{0}")]
     Invalid(String),
@@ -76,9 +72,6 @@ fn read_text(path: &Path) -> std::io::Result<String> {
 }
 
 /// Does [`read_checked_config`] on a text; `path` is only used in messages.
-///
-/// # Errors
-/// As [`read_checked_config`].
 pub fn parse_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     file: &str,

@@ -24,9 +24,6 @@ pub struct RankPlace {
 
 impl RankPlace {
     /// Finds the ranks that share the host and the cores of this one.
-    ///
-    /// # Errors
-    /// As [`Ranks::gather`].
     pub fn find(ranks: &Ranks) -> Result<Self, TrainError> {
         let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
         let cores = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:")).unwrap_or_default();

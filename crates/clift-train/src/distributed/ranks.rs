@@ -86,9 +86,6 @@ impl Ranks {
     }
 
     /// Returns whether the flag of any rank is set.
-    ///
-    /// # Errors
-    /// As [`Ranks::gather`].
     pub fn any(&self, flag: bool) -> Result<bool, TrainError> {
         Ok(self.gather(flag)?.contains(&true))
     }
@@ -180,21 +177,10 @@ impl Ranks {
         }
         values
     }
-
-    /// Returns the sum of the values of all ranks, added in the order of ranks: the same on every rank, bit for bit.
-    ///
-    /// # Errors
-    /// [`TrainError::RanksDiffer`] for different lengths, and those of [`Ranks::gather`].
-    pub fn sum(&self, values: &[f32]) -> Result<Vec<f32>, TrainError> {
-        self.require_same("the number of summed values", &values.len().to_string())?;
-        let mut sum = Vec::new();
-        self.add_ranges(values, values.len(), self.num_ranks(), &mut sum);
-        Ok(self.join_ranges(&sum, values.len()))
-    }
 }
 
 /// Returns the bytes that each of `num_ranks` ranks sends to sum `num_values` f32 values: as many as in a ring.
-pub fn sent_bytes(num_values: u64, num_ranks: usize) -> u64 {
+pub(crate) fn sent_bytes(num_values: u64, num_ranks: usize) -> u64 {
     let num_ranks = num_ranks as u64;
     2 * (num_ranks - 1) * 4 * num_values / num_ranks
 }
@@ -209,12 +195,19 @@ mod tests {
     use super::*;
     use crate::distributed::testing::on_threads;
 
+    /// Returns the sum of the values of all ranks.
+    fn sum(ranks: &Ranks, values: &[f32]) -> Vec<f32> {
+        let mut sum = Vec::new();
+        ranks.add_ranges(values, values.len(), ranks.num_ranks(), &mut sum);
+        ranks.join_ranges(&sum, values.len())
+    }
+
     #[test]
     fn sums_are_added_in_the_order_of_ranks() {
         // Rounding depends on the order: 1 is lost beside 1e8, unless -1e8 comes before it.
         let of_rank = [[1e8_f32, 1.0, -0.0], [-1e8, 1e8, -0.0], [1.0, -1e8, -0.0]];
         for num_ranks in 1..=3 {
-            let sums = on_threads(num_ranks, |ranks| ranks.sum(&of_rank[ranks.rank()]).unwrap());
+            let sums = on_threads(num_ranks, |ranks| sum(&ranks, &of_rank[ranks.rank()]));
             let expected: Vec<u32> = (0..3)
                 .map(|i| of_rank[1..num_ranks].iter().fold(of_rank[0][i], |sum, values| sum + values[i]).to_bits())
                 .collect();
@@ -226,8 +219,8 @@ mod tests {
 
     #[test]
     fn fewer_values_than_ranks_are_summed() {
-        assert_eq!(on_threads(3, |ranks| ranks.sum(&[1.5]).unwrap()), vec![[4.5]; 3]);
-        assert_eq!(on_threads(3, |ranks| ranks.sum(&[]).unwrap()), vec![[0.0; 0]; 3]);
+        assert_eq!(on_threads(3, |ranks| sum(&ranks, &[1.5])), vec![[4.5]; 3]);
+        assert_eq!(on_threads(3, |ranks| sum(&ranks, &[])), vec![[0.0; 0]; 3]);
     }
 
     #[test]

@@ -28,9 +28,6 @@ pub struct LargestTensor {
 }
 
 /// Returns the largest tensor of a step of a run, at the most views and tokens that can be sampled.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] for impossible sizes.
 pub fn largest_tensor(config: &Config, run_step: RunStep) -> Result<LargestTensor, TrainError> {
     let all = tensors(config, run_step)?;
     let (what, values) = all.into_iter().max_by_key(|(_, values)| *values).expect("every step has tensors");

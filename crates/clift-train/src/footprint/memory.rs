@@ -14,9 +14,6 @@ use crate::footprint::scene_sizes::{
 const PROCESS_BYTES: u64 = 20 << 20;
 
 /// Returns the peak memory of the process during a step of a run.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] for impossible sizes.
 pub fn peak_bytes(config: &Config, run_step: RunStep) -> Result<u64, TrainError> {
     let bytes = match run_step {
         RunStep::Train(stage) => update(config, stage)?,
@@ -28,9 +25,6 @@ pub fn peak_bytes(config: &Config, run_step: RunStep) -> Result<u64, TrainError>
 
 /// Describes the step of a run that exceeds the `available` memory the most, with a change of the config that fits;
 /// `None` if all steps fit or the available memory is unknown.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] for impossible sizes.
 pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<String>, TrainError> {
     let Some(available) = available else { return Ok(None) };
     let mut largest = None;

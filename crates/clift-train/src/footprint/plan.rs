@@ -58,9 +58,6 @@ pub struct PartPlan {
 }
 
 /// Estimates a run of `config` on `num_ranks` ranks, for the rank with the most work.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] for impossible values.
 pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
     check_plan(config)?;
     let parameters = Parameters::of(&config.model);
@@ -84,9 +81,6 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
 
 /// Estimates the seconds that a run takes after a step of a stage with the time `step_s`: the later work, in the
 /// multiply-accumulates of the plan, at the pace of this step. Parts whose number of scenes depends on the data do not count.
-///
-/// # Errors
-/// As [`plan`].
 pub fn remaining_s(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: f64) -> Result<f64, TrainError> {
     let plan = plan(config, num_ranks)?;
     let settings = config.stage(stage);
@@ -106,9 +100,6 @@ pub fn remaining_s(config: &Config, num_ranks: usize, stage: Stage, step: u64, s
 }
 
 /// Does [`Config::validate`] and [`Config::validate_half_resolution`] without requiring `data.root`.
-///
-/// # Errors
-/// Those of both.
 pub fn check_plan(config: &Config) -> Result<(), TrainError> {
     let mut config = config.clone();
     config.data.root.get_or_insert_with(Default::default);

@@ -9,7 +9,7 @@ use crate::error::{TrainError, bad};
 use crate::interchange::record::ImportOptions;
 
 /// Most characters of a key in a message.
-pub(crate) const MAX_SHOWN: usize = 160;
+const MAX_SHOWN: usize = 160;
 /// Most patterns of keys outside the network.
 const MAX_OUTSIDE: usize = 200;
 
@@ -85,7 +85,7 @@ fn starts_as_network(name: &str) -> bool {
         || first.ends_with("_norm")
 }
 
-pub(crate) fn is_number(part: &str) -> bool {
+fn is_number(part: &str) -> bool {
     !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())
 }
 

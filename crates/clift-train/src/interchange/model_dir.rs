@@ -41,9 +41,6 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
 }
 
 /// Refuses an output path that exists, also as a broken link.
-///
-/// # Errors
-/// [`TrainError::BadConfig`].
 pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     if path.symlink_metadata().is_err() {
         return Ok(());

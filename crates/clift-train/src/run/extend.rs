@@ -75,9 +75,6 @@ impl StepExtension {
 impl ExtensionRecord {
     /// Renames the weights of a finished stage. To be called before the new number of steps is in the run directory: a process
     /// killed in between makes these weights again.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn keep_weights(self, config: &Config, sink: &mut dyn Sink) -> Result<(), TrainError> {
         let Self { stage, from, to, at_step } = self;
         let own = config.run_dir.join(stage.name());

@@ -39,9 +39,6 @@ pub(crate) const LOCK: &str = "lock";
 
 /// Whether a folder has files besides a lock and the temporary files of killed processes. A missing folder, and a
 /// path that is not a folder, have none.
-///
-/// # Errors
-/// [`TrainError::Io`] for a folder that cannot be read.
 pub(crate) fn has_other_files(folder: &Path) -> Result<bool, TrainError> {
     let items = match std::fs::read_dir(folder) {
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(false),

@@ -155,9 +155,6 @@ pub struct RunLog<'a> {
 impl<'a> RunLog<'a> {
     /// Opens the files in `run_dir` after `step` updates of `stage`, the last validated one of which is `validated`, as
     /// [`StepLines::open`].
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn open(
         run_dir: &Path,
         stage: Stage,

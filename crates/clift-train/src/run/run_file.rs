@@ -142,9 +142,6 @@ pub fn lock_run(path: &Path, sink: &mut dyn Sink) -> Result<Option<RunLock>, Tra
 }
 
 /// Checks that a run directory is still at its path: a process that has it open must not make a second one there.
-///
-/// # Errors
-/// [`TrainError::Moved`].
 pub(crate) fn require_run(folder: &Path) -> Result<(), TrainError> {
     if folder.join(FILE).exists() { Ok(()) } else { Err(TrainError::Moved { path: folder.into() }) }
 }

@@ -16,9 +16,6 @@ pub(crate) struct TrainingData {
 
 impl TrainingData {
     /// Reads the section of the run in `folder`.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         #[derive(Deserialize)]
         struct Sections {

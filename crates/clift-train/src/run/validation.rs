@@ -140,9 +140,6 @@ impl<'a> Validation<'a> {
     }
 
     /// Evaluates models on the views of this validation, the scenes shared by the ranks.
-    ///
-    /// # Errors
-    /// As [`Evaluator::evaluate`].
     pub fn evaluate(
         &self,
         models: &EvalModels,

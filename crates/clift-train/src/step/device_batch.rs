@@ -46,9 +46,6 @@ impl TargetWeights {
 
 impl DeviceBatch {
     /// Copies the views of clips to a device.
-    ///
-    /// # Errors
-    /// Those of [`Views::upload`] for views of different sizes.
     pub fn upload(clips: &[Clip], device: &Device) -> Result<Self, TrainError> {
         let contexts: Vec<_> = clips.iter().map(|clip| &clip.context).collect();
         let targets: Vec<_> = clips.iter().map(|clip| &clip.target).collect();
@@ -96,9 +93,6 @@ impl DeviceBatch {
 }
 
 /// Renders the target views from selected tokens and returns the loss of an update, with autodiff.
-///
-/// # Errors
-/// Those of clusters that do not fit the tokens.
 pub fn render_loss(
     model: &Network,
     device_batch: &DeviceBatch,

@@ -69,9 +69,6 @@ pub struct LossParts {
 
 impl Loss {
     /// Makes the loss of a config; reads the VGG weights if there is a perceptual term.
-    ///
-    /// # Errors
-    /// As [`LossConfig::weights`] and [`Perceptual::load`].
     pub fn load(config: &LossConfig, device: &Device) -> Result<Self, TrainError> {
         let Some(path) = config.weights()? else { return Ok(Self::default()) };
         let network = Perceptual::load(path, &device.clone().without_autodiff())?;

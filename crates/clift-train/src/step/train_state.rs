@@ -65,9 +65,6 @@ impl TrainState {
 
     /// Makes one update from a batch in `accumulate` micro-batches. An update with a loss or gradient that is not finite is
     /// not applied.
-    ///
-    /// # Errors
-    /// As [`TrainState::step_if`].
     pub fn step(
         self,
         batch: &StageBatch,

@@ -15,12 +15,10 @@ pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
 
-/// Writes the result of a run, the path of its report, which has the whole table, and the command that shows its scenes, if
-/// the viewer can: seven lines for a small terminal.
+/// Writes the result of a run, and the command that shows its scenes, if the viewer can.
 pub fn print_run(summary: &Summary, run: &Path, has_view: bool) -> anyhow::Result<()> {
-    let report = run.join("eval").join("report.html");
-    let view = if has_view { format!("\nscenes: clift view {}", run.display()) } else { String::new() };
-    print_result(&format!("{}\nreport: {}{view}", summary.headline(), report.display()))
+    print_evaluation(summary, &run.join("eval"))?;
+    if has_view { print_result(&format!("scenes: clift view {}", run.display())) } else { Ok(()) }
 }
 
 /// Writes the table of an evaluation and the paths of its report and files.

@@ -4,16 +4,12 @@
 //! - `attention`: long and extreme attention
 //! - `updates`: updates on extreme views
 //! - `clusters`: degenerate clusters
-//! - `poses`: far and close cameras
-//! - `tokens`: rounded tokens
 //! - `training`: ten times the learning rate
 //! - `suite`: all cases, table
 
 pub(crate) mod attention;
 pub(crate) mod case;
 pub(crate) mod clusters;
-pub(crate) mod poses;
 pub(crate) mod suite;
-pub(crate) mod tokens;
 pub(crate) mod training;
 pub(crate) mod updates;

@@ -6,17 +6,13 @@
 use clift_model::DeviceName;
 use clift_train::TrainError;
 
-use crate::doctor::stability::case::{Bound, CaseDevices, CaseSize, Outcome, StabilityCase, StabilityRow};
-use crate::doctor::stability::{attention, clusters, poses, tokens, training, updates};
+use crate::doctor::stability::case::{CaseDevices, CaseSize, StabilityCase, StabilityRow};
+use crate::doctor::stability::{attention, clusters, training, updates};
 
 /// All cases, in the order of the table.
-const CASES: [&[StabilityCase]; 6] =
-    [updates::CASES, poses::CASES, clusters::CASES, attention::CASES, training::CASES, tokens::CASES];
+const CASES: [&[StabilityCase]; 4] = [updates::CASES, clusters::CASES, attention::CASES, training::CASES];
 
 /// Runs every case on the devices and passes each finished row to `report`.
-///
-/// # Errors
-/// Those of opening a device.
 pub fn run_stability(
     devices: &[DeviceName],
     size: CaseSize,
@@ -44,11 +40,7 @@ pub fn stability_markdown(devices: &[DeviceName], rows: &[StabilityRow]) -> Stri
     let rule = vec!["---".to_owned(); header.len()];
     let body = rows.iter().map(|row| {
         let StabilityCase { name, breaks, bound, reason, .. } = row.case;
-        let bound = match bound {
-            Bound::Most(most) => format!("{most:.0e}"),
-            Bound::Refused(_) => "refused".into(),
-        };
-        let mut cells: Vec<String> = vec![name.into(), breaks.into(), bound, reason.into()];
+        let mut cells: Vec<String> = vec![name.into(), breaks.into(), format!("{bound:.0e}"), reason.into()];
         cells.extend(row.outcomes.iter().map(|outcome| outcome_text(row, outcome)));
         line(&cells)
     });
@@ -57,13 +49,12 @@ pub fn stability_markdown(devices: &[DeviceName], rows: &[StabilityRow]) -> Stri
 }
 
 /// Formats an outcome as a table cell, in bold if it is beyond the bound.
-pub fn outcome_text(row: &StabilityRow, outcome: &Result<Outcome, String>) -> String {
+pub fn outcome_text(row: &StabilityRow, outcome: &Result<f64, String>) -> String {
     let text = match outcome {
-        Ok(Outcome::Error(error)) => format!("{error:.1e}"),
-        Ok(Outcome::Refused(_)) => "refused".into(),
+        Ok(error) => format!("{error:.1e}"),
         Err(reason) => reason.replace(['|', '\n'], " "),
     };
-    if outcome.as_ref().is_ok_and(|outcome| row.case.is_within_bound(outcome)) { text } else { format!("**{text}**") }
+    if outcome.as_ref().is_ok_and(|error| *error <= row.case.bound) { text } else { format!("**{text}**") }
 }
 
 #[cfg(test)]
@@ -82,16 +73,15 @@ mod tests {
             .collect();
         assert!(broken.is_empty(), "{}", broken.join("\n"));
         // A result in f32 that was compared with itself would be exact.
-        let measured =
-            |row: &StabilityRow| row.outcomes.iter().any(|o| matches!(o, Ok(Outcome::Error(error)) if *error > 0.0));
+        let measured = |row: &StabilityRow| row.outcomes.iter().any(|o| matches!(o, Ok(error) if *error > 0.0));
         let exact: Vec<&str> = rows.iter().filter(|row| !measured(row)).map(|row| row.case.name).collect();
         assert!(exact.len() < rows.len() / 2, "{exact:?}");
     }
 
     #[test]
     fn table_marks_outcomes_beyond_the_bound() {
-        let case = StabilityCase { name: "a", breaks: "b", bound: Bound::Most(1e-5), reason: "c", ..CASES[0][0] };
-        let outcomes = vec![Ok(Outcome::Error(2e-6)), Ok(Outcome::Error(f64::NAN)), Err("no|way".into())];
+        let case = StabilityCase { name: "a", breaks: "b", bound: 1e-5, reason: "c", ..CASES[0][0] };
+        let outcomes = vec![Ok(2e-6), Ok(f64::NAN), Err("no|way".into())];
         let row = StabilityRow { case, outcomes };
         assert!(!row.is_within_bound());
         let expected = "\

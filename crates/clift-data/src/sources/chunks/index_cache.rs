@@ -37,9 +37,6 @@ pub(crate) struct CachedScene {
 
 impl CachedChunk {
     /// Counts the scenes of the chunk at `path`, with their fields of view if `needs_fov`. `table` reads its table.
-    ///
-    /// # Errors
-    /// Those of reading the file and the cameras.
     pub fn of<'a>(
         path: &Path,
         table: impl FnOnce() -> Result<&'a ChunkTable, DataError>,

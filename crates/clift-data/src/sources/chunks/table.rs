@@ -6,8 +6,6 @@ use std::path::Path;
 use clift_core::{Camera, IntrinsicsNorm, widest_fov_deg};
 
 use crate::error::DataError;
-use crate::image::codec::check_encoded;
-use crate::sources::chunks::writer::{camera_bytes, timestamp_bytes};
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::pickle::Pickle;
 use crate::torch::tensor_span::tensor_span;
@@ -174,25 +172,5 @@ impl SceneTable {
     pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
         let Some(span) = self.timestamps else { return Ok((0..self.images.len() as i64).collect()) };
         Ok(self.usable(span.read(path)?.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect()))
-    }
-
-    /// Checks the image files without decoding them. Returns the unreadable ones with the reason.
-    pub fn unreadable_images(&self, path: &Path) -> Vec<(usize, String)> {
-        let reason = |span: &ByteSpan| match span.read(path) {
-            Ok(bytes) => check_encoded(&bytes).err(),
-            Err(error) => Some(error.to_string()),
-        };
-        self.images.iter().enumerate().filter_map(|(frame, span)| Some((frame, reason(span)?))).collect()
-    }
-
-    /// Returns whether these time stamps and cameras, one per frame, equal those of the file after rounding to f32.
-    pub fn is_of(
-        &self,
-        path: &Path,
-        timestamps: &[i64],
-        cameras: &[Camera<IntrinsicsNorm>],
-    ) -> Result<bool, DataError> {
-        let Some(span) = self.timestamps else { return Ok(false) };
-        Ok(span.read(path)? == timestamp_bytes(timestamps) && self.cameras.read(path)? == camera_bytes(cameras))
     }
 }

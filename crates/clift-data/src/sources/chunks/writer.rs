@@ -164,12 +164,12 @@ fn pack(path: &Path, pickle: PickleWriter) -> Result<Vec<u8>, DataError> {
 }
 
 /// Returns time stamps in the format of a chunk: i64.
-pub(crate) fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
+fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
     timestamps.iter().flat_map(|time| time.to_le_bytes()).collect()
 }
 
 /// Returns cameras in the format of a chunk: rows of 18 f32.
-pub(crate) fn camera_bytes(cameras: &[Camera<IntrinsicsNorm>]) -> Vec<u8> {
+fn camera_bytes(cameras: &[Camera<IntrinsicsNorm>]) -> Vec<u8> {
     let rows = cameras.iter().flat_map(Camera::to_re10k);
     rows.flat_map(|number| (number as f32).to_le_bytes()).collect()
 }

@@ -44,9 +44,6 @@ impl Default for ImageCacheConfig {
 
 impl ImageCacheConfig {
     /// Checks every field.
-    ///
-    /// # Errors
-    /// The invalid field.
     pub fn validate(&self) -> Result<(), BadConfig> {
         let is_valid = self.max_gb.is_finite() && self.max_gb >= 0.0;
         check_config(is_valid, "max_gb", self.max_gb, || "use 0 or more gigabytes".into())

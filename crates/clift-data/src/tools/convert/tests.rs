@@ -1,20 +1,20 @@
-//! Converted scenes equal those of the source, and an interrupted conversion ends with the same files.
+//! Converted scenes equal those of the source.
 
 use super::*;
 use crate::scene_source::Split;
 use crate::skip_report::SkippedScene;
+use crate::sources::chunks::table::ChunkTable;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::open::{OpenedSource, open_source};
 use crate::sources::options::SourceOptions;
 use crate::synthetic::source::SyntheticSource;
 use crate::testing::{self, TestSource, assert_same, fixture, names, re10k_mini};
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
 const SCENES: ConvertOptions = options(ConvertTo::Scenes);
 
 const fn options(to: ConvertTo) -> ConvertOptions {
-    ConvertOptions { to, encoding: ImageEncoding::Png, max_size: None, opened_with: String::new() }
+    ConvertOptions { to, encoding: ImageEncoding::Png, max_size: None }
 }
 
 fn convert_all(
@@ -70,7 +70,7 @@ fn converted_scenes_keep_cameras_and_image_files() {
         let report = SkipReport::new(2);
         let converter = Converter::open(&source, &report, &folder.path().join("train"), &options).unwrap();
         let report = converter.run(|done| seen.push(done)).unwrap();
-        assert_eq!((report.num_scenes, report.num_found, report.num_frames), (2, 0, 16));
+        assert_eq!((report.num_scenes, report.num_frames), (2, 16));
         assert_eq!((report.num_encoded, report.skipped.skips.len()), (0, 0));
         assert_eq!(seen, [1, 2]);
         let OpenedSource { source: back, report, .. } = open(folder.path(), Split::Train);
@@ -107,46 +107,24 @@ fn frames_without_an_image_file_are_encoded() {
     assert_same(&rooms(3), open(folder.path(), Split::Test).source.as_ref());
 }
 
-/// Returns rooms that panic after `num_frames` frames have been read, like a killed process.
-fn interrupted(num_scenes: usize, num_frames: usize) -> TestSource {
-    let left = AtomicUsize::new(num_frames);
-    TestSource::new(rooms(num_scenes)).with_frames(move |_, _, frame| {
-        let may = |left: usize| left.checked_sub(1);
-        assert!(left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, may).is_ok(), "killed");
+#[test]
+fn interrupted_conversion_leaves_a_folder_that_counts_as_empty() {
+    let folder = tempfile::tempdir().unwrap();
+    let killed = TestSource::new(rooms(3)).with_frames(|scene, _, frame| {
+        assert!(scene < 2, "killed");
         Ok(frame)
-    })
+    });
+    let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &SCENES));
+    assert!(std::panic::catch_unwind(run).is_err());
+    assert_eq!(names(folder.path()), [""; 0]);
+    convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
+    let before = files(folder.path());
+    let message = convert_all(&rooms(3), folder.path(), &SCENES).unwrap_err().to_string();
+    assert!(message.contains("it is not empty; choose another folder") && files(folder.path()) == before, "{message}");
 }
 
 #[test]
-fn interrupted_conversion_ends_with_the_same_files() {
-    for options in [CHUNKS, SCENES] {
-        let whole = tempfile::tempdir().unwrap();
-        convert_all(&rooms(6), whole.path(), &options).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        let killed = interrupted(6, 9);
-        let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &options));
-        assert!(std::panic::catch_unwind(run).is_err());
-        assert!(!folder.path().join("index.json").exists());
-        // One of the three files is damaged and written again.
-        let damaged = files(folder.path()).into_keys().find(|name| name.contains(".torch")).unwrap();
-        std::fs::write(folder.path().join(&damaged), [&files(folder.path())[&damaged][..], b"x"].concat()).unwrap();
-        let report = convert_all(&rooms(6), folder.path(), &options).unwrap();
-        assert_eq!((report.num_scenes, report.num_found, report.num_frames), (6, 2, 12));
-        let (got, expected) = (files(folder.path()), files(whole.path()));
-        assert!(got.keys().eq(expected.keys()), "{:?}", got.keys());
-        for name in got.keys().filter(|name| *name != "SHA256SUMS") {
-            assert!(got[name] == expected[name], "{name}");
-        }
-        // A finished conversion reads no image.
-        let again = interrupted(6, 0);
-        let report = convert_all(&again, folder.path(), &options).unwrap();
-        assert_eq!((report.num_found, report.num_frames), (6, 0));
-        assert_eq!(files(folder.path()).len(), expected.len());
-    }
-}
-
-#[test]
-fn skipped_scenes_are_reported_and_converted_later() {
+fn skipped_scenes_are_reported() {
     let folder = tempfile::tempdir().unwrap();
     let mut skipped = SkipReport::new(4);
     skipped.skip("far", "without any image");
@@ -159,28 +137,22 @@ fn skipped_scenes_are_reported_and_converted_later() {
     assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&report.skipped, 2, 1));
     assert_eq!(saved.skips[0], SkippedScene { key: "far".into(), reason: "without any image".into() });
     assert!(saved.skips[1].key.ends_with("00001") && saved.skips[1].reason.contains("it is torn"));
-    let report = convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
-    assert_eq!((report.num_scenes, report.num_found, report.skipped.skips.len()), (3, 2, 0));
-    assert!(!files(folder.path()).contains_key("skipped.json"));
 }
 
 #[test]
-fn unreadable_images_are_listed_in_every_run() {
+fn unreadable_images_are_listed() {
     let torn = TestSource::new(rooms(3)).with_encoded_frames(|scene, frame| {
         let image = ImageEncoding::Png.encode(&rooms(3).frame(scene, frame).unwrap()).unwrap();
         Some(if scene == 1 && frame > 0 { image[..image.len() - 1].to_vec() } else { image })
     });
     for options in [CHUNKS, SCENES] {
         let folder = tempfile::tempdir().unwrap();
-        for num_found in [0, 3] {
-            let report = convert_all(&torn, folder.path(), &options).unwrap();
-            assert_eq!((report.num_scenes, report.num_found), (3, num_found));
-            let unreadable: Vec<(&str, usize)> =
-                report.unreadable.iter().map(|image| (&*image.key, image.frame)).collect();
-            assert_eq!(unreadable, [(rooms(3).key(1), 1), (rooms(3).key(1), 2)]);
-            assert!(report.unreadable[0].reason.contains("the PNG data of"), "{}", report.unreadable[0].reason);
-            assert!(names(folder.path()).contains(&"unreadable.json".to_owned()));
-        }
+        let report = convert_all(&torn, folder.path(), &options).unwrap();
+        assert_eq!(report.num_scenes, 3);
+        let unreadable: Vec<(&str, usize)> = report.unreadable.iter().map(|image| (&*image.key, image.frame)).collect();
+        assert_eq!(unreadable, [(rooms(3).key(1), 1), (rooms(3).key(1), 2)]);
+        assert!(report.unreadable[0].reason.contains("the PNG data of"), "{}", report.unreadable[0].reason);
+        assert!(names(folder.path()).contains(&"unreadable.json".to_owned()));
     }
 }
 
@@ -195,46 +167,10 @@ fn scene_without_frames_is_skipped() {
 }
 
 #[test]
-fn folder_of_other_scenes_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
-    let message = convert_all(&re10k_mini(Split::Train), folder.path(), &SCENES).unwrap_err().to_string();
-    assert!(message.contains("which the source does not have; choose another folder"), "{message}");
+fn keys_that_no_file_can_have_are_refused() {
     assert!(!is_file_name("a/b") && !is_file_name("..") && is_file_name("1K-ab.c"));
     assert!(!"*?\"<>|".chars().any(|no| is_file_name(&format!("a{no}"))), "invalid on Windows");
     assert!(is_file_name(&"k".repeat(200)) && !is_file_name(&"k".repeat(201)));
-}
-
-#[test]
-fn scene_that_is_no_longer_readable_is_kept() {
-    for options in [CHUNKS, SCENES] {
-        let folder = tempfile::tempdir().unwrap();
-        convert_all(&rooms(3), folder.path(), &options).unwrap();
-        let before = names(folder.path());
-        let again = |reason: &str| {
-            let mut skipped = SkipReport::new(3);
-            skipped.skip(rooms(3).key(2), reason);
-            convert(&rooms(2), &skipped, folder.path(), &options)
-        };
-        let report = again("its cameras cannot be read").unwrap();
-        assert_eq!((report.num_scenes, report.num_found, report.skipped.num_used()), (3, 3, 3));
-        assert!(report.skipped.notes[0].starts_with("1 scene unreadable now, kept as converted before ("));
-        assert_eq!(names(folder.path()), before);
-        // Scenes reserved for testing are refused in a training folder.
-        let message = again(KEPT_FOR_TESTING).unwrap_err().to_string();
-        assert!(message.contains("which the source does not have; choose another folder"), "{message}");
-    }
-}
-
-#[test]
-fn outdated_index_is_removed_first() {
-    let folder = tempfile::tempdir().unwrap();
-    convert_all(&rooms(3), folder.path(), &CHUNKS).unwrap();
-    std::fs::remove_file(folder.path().join("000001.torch")).unwrap();
-    let killed = interrupted(3, 0);
-    let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS));
-    assert!(std::panic::catch_unwind(run).is_err());
-    assert_eq!(names(folder.path()), ["000000.torch", "000002.torch", "SHA256SUMS"]);
 }
 
 #[test]
@@ -252,52 +188,5 @@ fn chunks_and_scenes_have_a_largest_number_of_frames() {
     for name in ["000000.torch", "000001.torch"] {
         let table = ChunkTable::read(&folder.path().join(name)).unwrap();
         assert_eq!(table.scenes.into_values().map(|scene| scene.images.len()).collect::<Vec<_>>(), [30_000]);
-    }
-}
-
-#[test]
-fn folder_with_other_options_is_refused_unchanged() {
-    let folder = tempfile::tempdir().unwrap();
-    convert_all(&rooms(2), folder.path(), &CHUNKS).unwrap();
-    let before = files(folder.path());
-    let others = [
-        SCENES,
-        options(ConvertTo::Chunks { target_bytes: 2 }),
-        ConvertOptions { encoding: ImageEncoding::Jpeg(90), ..CHUNKS },
-        ConvertOptions { max_size: Some(48), ..CHUNKS },
-        ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
-    ];
-    for other in others {
-        let message = convert_all(&rooms(2), folder.path(), &other).unwrap_err().to_string();
-        assert!(message.contains("its files were made as: chunks of 1 bytes, PNG; requested: "), "{message}");
-        assert!(message.contains("use the same options or choose another folder"), "{message}");
-        assert!(files(folder.path()) == before);
-    }
-}
-
-#[test]
-fn changed_scenes_are_written_again() {
-    for (num_frames, shift) in [(2, 0.0), (3, 0.001)] {
-        // One chunk of all scenes, one chunk per scene, one file per scene.
-        let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
-        for (options, num_found) in [(one, 0), (CHUNKS, 2), (SCENES, 2)] {
-            let (folder, whole) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-            let before = TestSource::new(rooms(3)).with_cameras(move |scene, mut cameras| {
-                if scene == 1 {
-                    cameras.truncate(num_frames);
-                    cameras[0].c2w.translation[0] += shift;
-                }
-                Ok(cameras)
-            });
-            convert_all(&before, folder.path(), &options).unwrap();
-            let report = convert_all(&rooms(3), folder.path(), &options).unwrap();
-            assert_eq!((report.num_scenes, report.num_found, report.num_changed), (3, num_found, 1));
-            convert_all(&rooms(3), whole.path(), &options).unwrap();
-            let (mut got, mut expected) = (files(folder.path()), files(whole.path()));
-            for files in [&mut got, &mut expected] {
-                files.remove("SHA256SUMS"); // its lines are in the order of writing
-            }
-            assert!(got == expected, "{:?}", got.keys());
-        }
     }
 }

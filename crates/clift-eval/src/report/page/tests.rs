@@ -6,7 +6,6 @@ use crate::config::method::{Method, MethodName};
 use crate::figures::canvas::Canvas;
 use crate::figures::scene_figure::{FigureImage, FigureTokens};
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::scene_scores::SceneScore;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 use crate::testing::f32_key as key;
 
@@ -76,10 +75,6 @@ fn report() -> Report {
         },
         summary: summary(),
         training: vec![TrainingCurve { stage: "stage1", training: vec![(1, 9.0)], validation: vec![(1, 8.0)] }],
-        scenes: SceneScores {
-            key: Some(key(Method::Clift, 8, 8)),
-            scenes: ["a", "b"].map(|scene| SceneScore { scene: scene.into(), psnr: 18.0, nearest_psnr: None }).into(),
-        },
         skipped,
         figures: vec![figure()],
     }
@@ -95,7 +90,6 @@ fn pages_have_all_sections_and_no_external_resources() {
     for part in [
         "<h2>Quality and cost</h2>",
         "<h2>All points</h2>",
-        "<h2>Scene by scene</h2>",
         "<h2>Images of scenes</h2>",
         "<h2>Training</h2>",
         "<h2>Skipped scenes</h2>",

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use clift_data::{DatasetRoot, FileOptions, OpenedSource, SourceOptions, Split, TestScenes, is_dl3dv_key, open_source};
-use clift_train::{Override, parse_config};
+use clift_train::parse_config;
 use serde::{Deserialize, Serialize};
 
 use crate::commands::args::parse::parse_input;
@@ -35,14 +35,14 @@ pub struct SourceArgs {
 }
 
 impl SourceArgs {
-    /// Returns the options of `--set` and what they changed.
-    pub fn files(&self) -> anyhow::Result<(FileOptions, Vec<Override>)> {
-        let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set, |_| Ok(()))?;
-        Ok((keys.data.files, changes))
+    /// Returns the options of `--set`.
+    pub fn files(&self) -> anyhow::Result<FileOptions> {
+        let (keys, _) = parse_config::<Keys>(Path::new("--set"), "", &self.set, |_| Ok(()))?;
+        Ok(keys.data.files)
     }
 
     pub fn open(&self, splits: Splits) -> anyhow::Result<Vec<SplitSource>> {
-        open_splits(&self.dir, splits, &self.files()?.0)
+        open_splits(&self.dir, splits, &self.files()?)
     }
 }
 

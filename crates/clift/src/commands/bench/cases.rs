@@ -7,7 +7,6 @@ use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchReport, BenchRow, MA
 use clift_eval::table;
 use clift_model::Precision;
 
-use crate::commands::bench::allreduce::BenchAllReduceArgs;
 use crate::commands::bench::data::BenchDataArgs;
 use crate::commands::bench::precision::BenchPrecisionArgs;
 use crate::commands::bench::timing_args::TimingArgs;
@@ -87,8 +86,6 @@ fn cells(row: &BenchRow, peak: Option<f64>) -> [String; 6] {
 /// Measurements other than the cases of a config.
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
-    /// Time the sum over ranks, under `mpirun` or `srun`
-    Allreduce(BenchAllReduceArgs),
     /// Time reading clips from a data set, in order and at random
     Data(BenchDataArgs),
     /// Compare f16 or bf16 with f32 matrix products: time, loss, PSNR, gradient

@@ -16,7 +16,7 @@ pub enum DataCommand {
     ///
     /// Ray-traced scenes with exact cameras are written to OUT/train and OUT/test as NNNNNN.torch files, which
     /// `torch.load` reads too, with an index.json per folder. The test split also gets `OUT/evaluation_index.json`, for
-    /// `clift eval --index`. The command prints the config section that trains on these scenes.
+    /// `clift eval --index`.
     #[command(after_help = "\
 Examples:
   clift data synth /data/rooms
@@ -41,18 +41,15 @@ Examples:
   clift data poses attic.mp4 -o captures/attic --frames 150
   clift data poses photos/walk -o captures/walk --matching neighbours")]
     Poses(PosesArgs),
-    /// Describe a data set, a config's use of it, or an evaluation index
+    /// Describe a data set or an evaluation index
     ///
     /// Recognises every layout: chunks, files per scene, RealEstate10K text files, DL3DV folders, captures with
     /// transforms.json or a COLMAP model. Prints per split: scenes, frames (smallest / median / largest), image size,
-    /// field of view, extent of the camera path, frames without an image. For a config also the scenes that remain after
-    /// its filters, views and evaluation, and the tokens per scene.
+    /// field of view, extent of the camera path, frames without an image.
     #[command(after_help = "\
 Examples:
   clift data info /data/re10k
-  clift data info captures/attic
-  clift data info configs/tiny.toml
-  clift data info configs/re10k.toml --set data.filters.min_frames=60 --json info.json")]
+  clift data info captures/attic --json info.json")]
     Info(InfoArgs),
     /// Check images, cameras, and whether poses match the images
     ///
@@ -78,9 +75,8 @@ Examples:
     ///
     /// Writes the splits of DIR to OUT/train and OUT/test. A data set without splits, such as captures, becomes OUT itself,
     /// unless `data.files.test_scenes` divides it. Image files are copied byte by byte, unless their lens distortion is
-    /// removed or --max-size reduces them.
-    /// An interrupted conversion resumes: SHA256SUMS lists the complete files, and `sha256sum -c SHA256SUMS` verifies
-    /// them at any time. Exits with 1 if an image is unreadable or no scene of a split can be converted.
+    /// removed or --max-size reduces them. The files of a split appear when all are complete. Exits with 1 if an image is
+    /// unreadable or no scene of a split can be converted.
     #[command(after_help = "\
 Examples:
   clift data convert captures/fox fox-chunks --to chunks --max-size 512 --quality 95

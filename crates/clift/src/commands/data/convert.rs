@@ -28,13 +28,8 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
         ConvertForm::Chunks => ConvertTo::Chunks { target_bytes: args.chunks.target_bytes() },
         ConvertForm::Scenes => ConvertTo::Scenes,
     };
-    let (files, mut changes) = args.source.files()?;
-    // The list of test scenes selects scenes and changes nothing in them.
-    changes.retain(|change| change.key != "data.files.test_scenes");
-    changes.sort_by(|a, b| a.key.cmp(&b.key));
-    let opened_with = changes.iter().map(|change| format!("{}={}", change.key, change.to)).collect::<Vec<_>>();
-    let opened_with = opened_with.join(" ");
-    let options = ConvertOptions { to, encoding: args.chunks.encoding(), max_size: args.max_size, opened_with };
+    let files = args.source.files()?;
+    let options = ConvertOptions { to, encoding: args.chunks.encoding(), max_size: args.max_size };
 
     let dir = &args.source.dir;
     let splits = open_splits(dir, args.split, &files)?;
@@ -92,22 +87,11 @@ fn print_some(mut lines: impl Iterator<Item = String>) {
 }
 
 fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder: &Path) -> String {
-    let ConversionReport {
-        num_scenes,
-        num_found,
-        num_changed,
-        num_frames,
-        num_encoded,
-        image_bytes,
-        unreadable,
-        skipped,
-    } = report;
+    let ConversionReport { num_scenes, num_frames, num_encoded, image_bytes, unreadable, skipped } = report;
     let optional = |number: usize, text: &str| if number > 0 { format!(", {number} {text}") } else { String::new() };
-    let found = optional(*num_found, "of them already complete");
-    let changed = optional(*num_changed, "rewritten, because cameras or frames changed");
     let unreadable = optional(unreadable.len(), "unreadable");
     format!(
-        "{}: {} of {}{found}{changed}; {} written, {} copied and {num_encoded} encoded{unreadable}, {} in {seconds:.1} s: {}",
+        "{}: {} of {}; {} written, {} copied and {num_encoded} encoded{unreadable}, {} in {seconds:.1} s: {}",
         split.name(),
         plural(*num_scenes, "scene"),
         skipped.num_scenes,
@@ -148,7 +132,7 @@ fn real_path(path: &Path) -> std::io::Result<PathBuf> {
 pub struct ConvertArgs {
     #[command(flatten)]
     pub source: SourceArgs,
-    /// Output folder: new, or of an interrupted conversion
+    /// Output folder: new or empty
     pub out: PathBuf,
     /// Layout to write
     #[arg(long, value_enum)]

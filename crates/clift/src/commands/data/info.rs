@@ -3,24 +3,15 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexStatistics, OpenedSource, SceneSource, SceneSubset,
-    SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
+    DataError, DatasetRoot, EvaluationIndex, IndexStatistics, SceneSource, SkipReport, SourceInfo, open_source,
 };
-use clift_eval::{EvalFrames, evaluation_items};
-use clift_train::Config;
 
-use crate::commands::args::shared_args::{JsonArg, read_config};
+use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{Splits, present_splits, read_all_options};
-use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
-use crate::exit_code::usage_bail;
-use crate::output::counter::ScanCounter;
+use crate::commands::data::info_report::{Report, SplitReport};
 use crate::output::stdout::print_result;
-
-/// Most synthetic scenes that are described: a config may have millions of similar ones.
-const MAX_SYNTHETIC: usize = 1000;
 
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let json = args.json.open(&[&args.path])?;
@@ -33,20 +24,11 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
         print_result(&format!("{statistics}\n"))?;
         return json.write(&statistics);
     }
-    let report = if args.path.is_dir() || is_scene {
-        if !args.set.is_empty() {
-            usage_bail!("--set needs a config, {} is a data set", args.path.display());
-        }
-        describe_folder(&args.path)?
-    } else {
-        let (config, _) = read_config(&args.path, &args.set, Config::validate)?;
-        describe_config(&args.path, &config)?
-    };
+    let report = describe_folder(&args.path)?;
     print_result(&report.to_string())?;
     json.write(&report)?;
-    let failed = report.splits.values().filter_map(|split| split.error.as_ref());
-    let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
-    anyhow::ensure!(failed.count() == 0, "a part of the data is not usable; the table above lists the reason");
+    let is_usable = report.splits.values().all(|split| split.error.is_none());
+    anyhow::ensure!(is_usable, "a part of the data is not usable; the table above lists the reason");
     Ok(())
 }
 
@@ -68,38 +50,6 @@ fn describe_folder(root: &Path) -> anyhow::Result<Report> {
     Ok(report)
 }
 
-fn describe_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
-    let data = &config.data;
-    let mut report = Report { path: path.to_owned(), ..Report::default() };
-    for split in [Split::Train, Split::Test] {
-        let mut counter = ScanCounter::default();
-        let opened = open_dataset(data, split, &mut |done, total| counter.set(done, total));
-        let described = opened.and_then(|opened| {
-            if split == Split::Test {
-                let frames = EvalFrames::new(&opened, split, data.hold_out, true);
-                report.evaluation = Some(evaluation(config, opened.source.clone(), frames));
-            }
-            let first = |source| -> Arc<dyn SceneSource> {
-                match data.source {
-                    SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
-                    _ => source,
-                }
-            };
-            let training = first(opened.training_source(data.hold_out));
-            let OpenedSource { source, report: skips, .. } = opened;
-            let mut described = describe_split(first(source).as_ref(), &skips)?;
-            if split == Split::Train {
-                described.views = Some(long_enough(config, training.as_ref()));
-            }
-            Ok(described)
-        });
-        report.splits.insert(split.to_string(), or_error(described));
-    }
-    let tokens = |num_views| config.model.num_tokens(num_views, data.height, data.width);
-    report.num_tokens = Some([tokens(data.views.min_context)?, tokens(data.views.max_context)?]);
-    Ok(report)
-}
-
 fn describe_split(source: &dyn SceneSource, skips: &SkipReport) -> Result<SplitReport, clift_data::DataError> {
     Ok(SplitReport {
         error: None,
@@ -109,10 +59,8 @@ fn describe_split(source: &dyn SceneSource, skips: &SkipReport) -> Result<SplitR
         left_out: skips.skips.clone(),
         frames: skips.frames.clone(),
         notes: skips.notes.clone(),
-        num_described: source.num_scenes(),
         keys: (0..source.num_scenes()).map(|scene| source.key(scene).to_owned()).collect(),
         info: Some(SourceInfo::read(source)?),
-        views: None,
     })
 }
 
@@ -124,39 +72,11 @@ fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
     described.unwrap_or_else(|error| SplitReport { error: Some(error.to_string()), ..Default::default() })
 }
 
-/// Returns the frames that `data.views` needs at the last step, and the number of scenes with as many training frames.
-fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
-    let needed = config.data.views.min_frames(config.stage1.steps);
-    let mut num_long = 0;
-    for scene in 0..source.num_scenes() {
-        // Unreadable scenes are part of the description.
-        num_long += usize::from(source.num_frames(scene).is_ok_and(|count| count >= needed));
-    }
-    [needed, num_long]
-}
-
-fn evaluation(config: &Config, source: Arc<dyn SceneSource>, frames: EvalFrames) -> EvaluationReport {
-    let reader = ClipReader { source, options: config.data.clip_options() };
-    match evaluation_items(&config.eval, &reader, frames) {
-        Ok((items, skips, split)) => EvaluationReport {
-            error: None,
-            split: Some(split),
-            num_scenes: items.len(),
-            num_views: items.iter().map(|item| item.views.target.len()).sum(),
-            skipped: counts(&skips),
-        },
-        Err(error) => EvaluationReport { error: Some(error.to_string()), ..Default::default() },
-    }
-}
-
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
-    /// Data set, one scene, config (TOML) or evaluation index (JSON)
-    #[arg(value_name = "DIR|CONFIG|INDEX")]
+    /// Data set, one scene, or evaluation index (JSON)
+    #[arg(value_name = "DIR|INDEX")]
     pub path: PathBuf,
-    /// Override a key of the config, e.g. `data.filters.min_frames=60`; repeatable
-    #[arg(long, value_name = "KEY=TOML")]
-    pub set: Vec<String>,
     #[command(flatten)]
     pub json: JsonArg,
 }
@@ -164,7 +84,7 @@ pub struct InfoArgs {
 #[cfg(test)]
 mod tests {
     use clift_core::RgbImage;
-    use clift_data::encode_png;
+    use clift_data::{SourceKind, encode_png};
 
     use super::*;
 
@@ -187,31 +107,6 @@ test              1 scene
         assert!(text.starts_with(expected), "{text}");
     }
 
-    #[test]
-    fn config_is_described_with_its_remaining_scenes() {
-        let mut config = Config::default();
-        (config.data.source, config.data.root) = (SourceKind::Chunks, Some(fixtures()));
-        (config.data.width, config.data.height) = (48, 32);
-        config.data.filters.min_frames = 8;
-        config.eval.index = Some(fixtures().join("evaluation_index.json"));
-        let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
-        assert!(text.contains("  long enough     0 of 2: data.views.min_gap needs 46 training frames"), "{text}");
-        assert!(
-            text.contains("evaluation        4 views of 1 scene, test split\n  skipped         2 without views"),
-            "{text}"
-        );
-        assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
-
-        config.data.filters.min_frames = 9;
-        let report = describe_config(Path::new("a.toml"), &config).unwrap();
-        let error = report.splits["train"].error.as_deref().unwrap();
-        assert!(
-            error.contains("0 of 2 scenes used; 2 shorter than the 9 frames of data.filters.min_frames"),
-            "{error}"
-        );
-        assert!(report.evaluation.is_none());
-    }
-
     fn write_capture(folder: &Path, width: usize, num_photos: usize) {
         std::fs::create_dir(folder).unwrap();
         let image = RgbImage { width, height: 24, rgb: vec![9; width * 24 * 3] };
@@ -223,22 +118,6 @@ test              1 scene
         }
         let cameras = format!(r#"{{"fl_x": 20, "frames": [{}]}}"#, frames.join(","));
         std::fs::write(folder.join("transforms.json"), cameras).unwrap();
-    }
-
-    #[test]
-    fn held_out_frames_do_not_make_a_capture_long_enough() {
-        let root = tempfile::tempdir().unwrap();
-        write_capture(&root.path().join("attic"), 32, 7);
-        let mut config = Config::default();
-        (config.data.source, config.data.root) = (SourceKind::Captures, Some(root.path().to_owned()));
-        (config.data.width, config.data.height) = (32, 24);
-        (config.data.views.min_gap, config.data.views.max_gap) = ([5, 6], [8, 24]);
-        for (hold_out, expected) in [(8, "0 of 1"), (0, "1 of 1")] {
-            config.data.hold_out = hold_out;
-            let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
-            let expected = format!("  long enough     {expected}: data.views.min_gap needs 7 training frames");
-            assert!(text.contains(&expected), "{text}");
-        }
     }
 
     #[test]
@@ -283,7 +162,7 @@ test              1 scene
 
     #[test]
     fn skipped_frames_are_listed_by_scene() {
-        let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
+        let mut split = SplitReport { num_scenes: 1, num_used: 1, ..SplitReport::default() };
         let mut skips = SkipReport::new(1);
         for name in ["0005.jpg", "0016.jpg"] {
             skips.skip_frame("fox", name, "without an image");

@@ -5,7 +5,6 @@ use std::fmt;
 use std::path::PathBuf;
 
 use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind, plural};
-use clift_eval::EvalSplit;
 use serde::Serialize;
 
 /// Most keys, and most image sizes, that the table lists.
@@ -21,9 +20,6 @@ pub struct Report {
     pub layout: Option<SourceKind>,
     /// Splits by name; `all` for a data set without splits.
     pub splits: BTreeMap<String, SplitReport>,
-    pub evaluation: Option<EvaluationReport>,
-    /// Tokens per scene of a config, with the fewest and the most contexts.
-    pub num_tokens: Option<[usize; 2]>,
 }
 
 #[derive(Debug, Default, Serialize)]
@@ -38,25 +34,10 @@ pub struct SplitReport {
     pub left_out: Vec<SkippedScene>,
     pub frames: Vec<SkippedFrame>,
     pub notes: Vec<String>,
-    /// Number of scenes that `info` describes: all used scenes, or the first synthetic ones.
-    pub num_described: usize,
-    /// Keys of these scenes.
+    /// Keys of the used scenes.
     pub keys: Vec<String>,
-    /// Sizes and extents of these scenes.
+    /// Sizes and extents of the used scenes.
     pub info: Option<SourceInfo>,
-    /// Training frames that `data.views` needs, and the number of described scenes that have them; for training scenes.
-    pub views: Option<[usize; 2]>,
-}
-
-#[derive(Debug, Default, Serialize)]
-pub struct EvaluationReport {
-    /// Reason why no scene can be evaluated.
-    pub error: Option<String>,
-    /// What is measured on.
-    pub split: Option<EvalSplit>,
-    pub num_scenes: usize,
-    pub num_views: usize,
-    pub skipped: BTreeMap<String, usize>,
 }
 
 impl fmt::Display for Report {
@@ -71,18 +52,6 @@ impl fmt::Display for Report {
                 None => rows.push((name, "not found".into())),
                 Some(split) => split.rows(name, &mut rows),
             }
-        }
-        if let Some(evaluation) = &self.evaluation {
-            let counted =
-                format!("{} of {}", plural(evaluation.num_views, "view"), plural(evaluation.num_scenes, "scene"));
-            let split = evaluation.split.map_or_else(String::new, |split| format!(", {split}"));
-            rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted + &split)));
-            rows.extend(evaluation.skipped.iter().map(|(reason, count)| ("  skipped", format!("{count} {reason}"))));
-        }
-        match self.num_tokens {
-            Some([fewest, most]) if fewest == most => rows.push(("tokens per scene", fewest.to_string())),
-            Some([fewest, most]) => rows.push(("tokens per scene", format!("{fewest} to {most}"))),
-            None => {}
         }
         let lines: Vec<String> = rows.iter().map(|(name, value)| format!("{name:<18}{value}")).collect();
         f.write_str(&lines.join("\n"))
@@ -144,9 +113,7 @@ impl SplitReport {
             return;
         }
         let used = if self.skipped.is_empty() { String::new() } else { format!("{} of ", self.num_used) };
-        let first = format!("; described by the first {}", self.num_described);
-        let first = if self.num_described < self.num_used { first.as_str() } else { "" };
-        rows.push((name, format!("{used}{}{first}", plural(self.num_scenes, "scene"))));
+        rows.push((name, format!("{used}{}", plural(self.num_scenes, "scene"))));
         let keys: Vec<&str> = self.keys.iter().map(String::as_str).take(MAX_LISTED_KEYS + 1).collect();
         if !keys.is_empty() {
             rows.push(("  keys", first_names(&keys, MAX_LISTED_KEYS)));
@@ -169,13 +136,6 @@ impl SplitReport {
         }
         if let Some(extent) = info.extent {
             rows.push(("  path extent", format!("{extent:.3}")));
-        }
-        if let Some([needed, num_long]) = self.views {
-            let of = self.num_described;
-            rows.push((
-                "  long enough",
-                format!("{num_long} of {of}: data.views.min_gap needs {}", plural(needed, "training frame")),
-            ));
         }
     }
 }

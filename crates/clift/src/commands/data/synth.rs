@@ -6,8 +6,7 @@ use std::time::Instant;
 use anyhow::Context;
 use clift_core::{TEMPORARY, publish_folder};
 use clift_data::{
-    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, plural,
-    read_scene, write_chunks, write_evaluation_index,
+    EvaluationIndex, Split, SyntheticConfig, SyntheticSource, plural, read_scene, write_chunks, write_evaluation_index,
 };
 use clift_eval::EvalConfig;
 use clift_model::ModelConfig;
@@ -31,7 +30,6 @@ const INDEX: &str = "evaluation_index.json";
 pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     let config = config(args)?;
     require_absent(&args.out, args.split)?;
-    require_same_size(&args.out, args.split, &config)?;
     let (size, [width, height]) = ([config.width, config.height], cropped(&config));
     if size != [width, height] && width > 0 && height > 0 {
         let (size, patch) = (format!("{}x{}", size[0], size[1]), patch_size());
@@ -109,54 +107,14 @@ fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {
     Ok(config)
 }
 
-/// Checks that `out` contains nothing but the other split and its index, and what an interrupted command left.
+/// Checks that the splits and the index are not there yet.
 fn require_absent(out: &Path, splits: Splits) -> anyhow::Result<()> {
-    if !out.exists() {
-        return Ok(());
+    let index = splits.list().contains(&Split::Test).then(|| INDEX.to_owned());
+    let names = splits.list().iter().map(ToString::to_string).chain(index);
+    match names.map(|name| out.join(name)).find(|path| path.exists()) {
+        Some(path) => usage_bail!("{} exists; choose another folder or move it away", path.display()),
+        None => Ok(()),
     }
-    let mut allowed = Vec::new();
-    match splits {
-        Splits::Train => allowed.extend(["test".to_owned(), INDEX.to_owned()]),
-        Splits::Test => allowed.push("train".to_owned()),
-        Splits::Both => {}
-    }
-    let folder = std::fs::read_dir(out).with_context(|| format!("opening {}", out.display()))?;
-    for entry in folder {
-        let path: PathBuf = entry.with_context(|| format!("reading {}", out.display()))?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        if name.starts_with(TEMPORARY) || allowed.iter().any(|allowed| *allowed == name) {
-            continue;
-        }
-        let other = match (splits, name.as_ref()) {
-            (Splits::Both, "train") if !out.join("test").exists() => ", or write the other split with --split test",
-            _ => "",
-        };
-        usage_bail!("{} exists; choose another folder or move it away{other}", path.display());
-    }
-    Ok(())
-}
-
-/// Checks that the other split has the same sizes: one config section is for both.
-fn require_same_size(out: &Path, splits: Splits, config: &SyntheticConfig) -> anyhow::Result<()> {
-    for split in [Split::Train, Split::Test].into_iter().filter(|split| !splits.list().contains(split)) {
-        let folder = out.join(split.to_string());
-        if !folder.join("index.json").exists() {
-            continue;
-        }
-        let source = ChunkSource::open(out, split, &SceneFilters::default())?;
-        if source.num_scenes() == 0 {
-            continue;
-        }
-        let (image, num_frames) = (source.frame(0, 0)?, source.num_frames(0)?);
-        let text = |num_frames, width, height| format!("{}, {width}x{height}", plural(num_frames, "frame"));
-        let found = text(num_frames, image.width, image.height);
-        let requested = text(config.num_frames, config.width, config.height);
-        if found != requested {
-            let folder = folder.display();
-            usage_bail!("{folder} has scenes of {found}, not of {requested}; use the same sizes or another folder");
-        }
-    }
-    Ok(())
 }
 
 /// Returns whether the file is an evaluation index with at least one scene.
@@ -219,7 +177,7 @@ num_targets = 3{eval}"
 
 #[derive(Debug, clap::Args)]
 pub struct SynthArgs {
-    /// Output folder: new, or with only the other split, of the same size
+    /// Output folder, without the split
     pub out: PathBuf,
     /// Kind of scenes: plain rooms, or scenes with the statistics of photos
     #[arg(long, value_parser = ["rooms", "real"])]
@@ -248,7 +206,7 @@ pub struct SynthArgs {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{ImageEncoding, Look, even_views};
+    use clift_data::{Look, even_views};
     use clift_train::Config;
 
     use super::*;
@@ -322,37 +280,13 @@ mod tests {
     }
 
     #[test]
-    fn other_split_of_another_size_is_refused() {
+    fn existing_splits_and_indices_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let config = SyntheticConfig { num_scenes: 1, num_frames: 3, width: 16, height: 8, ..Default::default() };
-        let source = SyntheticSource::new(config.clone()).unwrap();
-        let record = read_scene(&source, 0, ImageEncoding::Png, None).unwrap().0;
-        write_chunks(&folder.path().join("train"), [Ok(record)], 1).unwrap();
-        let refused = |splits, config| require_same_size(folder.path(), splits, &config).err();
-        assert!(refused(Splits::Test, config.clone()).is_none());
-        for (other, requested) in [
-            (SyntheticConfig { width: 24, ..config.clone() }, "3 frames, 24x8"),
-            (SyntheticConfig { num_frames: 4, ..config.clone() }, "4 frames, 16x8"),
-        ] {
-            let error = refused(Splits::Test, other).unwrap();
-            let expected = format!("train has scenes of 3 frames, 16x8, not of {requested}; use the same sizes");
-            assert!(error.to_string().contains(&expected), "{error}");
-            assert_eq!(crate::exit_code::exit_code(&error), crate::exit_code::USAGE);
-        }
-    }
-
-    #[test]
-    fn folder_with_other_files_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let refused = |splits| require_absent(folder.path(), splits).err().map(|error| error.to_string());
-        assert_eq!(refused(Splits::Both), None);
         std::fs::create_dir(folder.path().join("train")).unwrap();
+        let refused = |splits| require_absent(folder.path(), splits).err().map(|error| error.to_string());
         assert_eq!(refused(Splits::Test), None);
-        std::fs::create_dir(folder.path().join(".clift-test")).unwrap();
-        assert_eq!(refused(Splits::Test), None, "of an interrupted command");
-        assert!(refused(Splits::Both).unwrap().ends_with("or write the other split with --split test"));
-        std::fs::write(folder.path().join("notes.txt"), "").unwrap();
-        assert!(refused(Splits::Test).unwrap().contains("notes.txt exists"));
-        assert_eq!(require_absent(&folder.path().join("new"), Splits::Both).ok(), Some(()));
+        assert!(refused(Splits::Both).unwrap().contains("train exists; choose another folder"));
+        std::fs::write(folder.path().join(INDEX), "").unwrap();
+        assert!(refused(Splits::Test).unwrap().contains("evaluation_index.json exists"));
     }
 }

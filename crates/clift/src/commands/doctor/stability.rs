@@ -48,5 +48,5 @@ Each case is a real computation in f32, compared with the same code on the same 
 operations instead of the kernels. The error is the largest difference over the largest value; of an update, over its
 loss and the gradient of every parameter. A gradient below a thousandth of the largest one is compared with that
 thousandth, because a gradient that is zero in exact arithmetic contains only rounding. **Bold** values exceed their
-bound. `refused` cases have an error message and a test of their own.
+bound.
 ";
