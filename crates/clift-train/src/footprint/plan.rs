@@ -79,9 +79,17 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
     })
 }
 
-/// Estimates the seconds that a run takes after a step of a stage with the time `step_s`: the later work, in the
-/// multiply-accumulates of the plan, at the pace of this step. Parts whose number of scenes depends on the data do not count.
-pub fn remaining_s(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: f64) -> Result<f64, TrainError> {
+/// What the time of a step says about a run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pace {
+    /// Floating-point operations per second of the rank with the most work.
+    pub flops_per_s: f64,
+    /// Seconds of the later work at this pace. Parts whose number of scenes depends on the data do not count.
+    pub remaining_s: f64,
+}
+
+/// Derives the pace of a run from the wall time `step_s` of a step of a stage, by the multiply-accumulates of the plan.
+pub fn pace(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: f64) -> Result<Pace, TrainError> {
     let plan = plan(config, num_ranks)?;
     let settings = config.stage(stage);
     let (batch_size, _) = scenes_of_rank(config, stage, num_ranks);
@@ -96,7 +104,8 @@ pub fn remaining_s(config: &Config, num_ranks: usize, stage: Stage, step: u64, s
     let mut later = num_half * half + (settings.steps.saturating_sub(step) as f64 - num_half) * whole;
     let parts = plan.parts.iter().skip_while(|part| part.part != stage.name()).skip(1);
     later += parts.map(|part| part.count.unwrap_or_default() as f64 * part.gmacs).sum::<f64>();
-    Ok(step_s * later / if settings.is_half_resolution(step) { half } else { whole })
+    let of_step = if settings.is_half_resolution(step) { half } else { whole };
+    Ok(Pace { flops_per_s: 2e9 * of_step / step_s, remaining_s: step_s * later / of_step })
 }
 
 /// Does [`Config::validate`] and [`Config::validate_half_resolution`] without requiring `data.root`.
@@ -271,9 +280,11 @@ mod tests {
         let gmacs = |i: usize| parts[i].count.expect("known") as f64 * parts[i].gmacs;
         let step = parts[0].gmacs;
         let assert_left = |config: &Config, stage, step, gmacs: f64| {
-            let left = remaining_s(config, 1, stage, step, 2.0).expect("valid");
+            let left = pace(config, 1, stage, step, 2.0).expect("valid").remaining_s;
             assert!((left / (2.0 * gmacs) - 1.0).abs() < 1e-9, "{left} {gmacs}");
         };
+        let rate = pace(&config, 1, Stage::Stage1, 0, 2.0).expect("valid").flops_per_s;
+        assert!((rate / (1e9 * step) - 1.0).abs() < 1e-9, "two operations per multiply-accumulate in two seconds");
         assert_left(&config, Stage::Stage1, 0, (gmacs(0) + gmacs(1) + gmacs(2) + gmacs(3)) / step);
         assert_left(&config, Stage::Stage2, config.stage2.steps, gmacs(3) / parts[2].gmacs);
         config.stage1.half_resolution = 0.5;

@@ -5,7 +5,7 @@ use std::rc::Rc;
 
 use clift_eval::available_bytes;
 use clift_train::{
-    BatchParts, Config, Event, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning, remaining_s,
+    BatchParts, Config, Event, Pace, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning, pace,
 };
 
 use crate::commands::args::adapter::name_adapter;
@@ -42,9 +42,10 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     let mut sink = move |event: &Event| {
         sink.event(event);
         if let (Event::Pace { stage, step, step_s, .. }, None) = (event, args.only)
-            && let Ok(left_s) = remaining_s(&planned, num_ranks, *stage, *step, *step_s)
+            && let Ok(Pace { flops_per_s, remaining_s }) = pace(&planned, num_ranks, *stage, *step, *step_s)
         {
-            let text = format!("all stages and the evaluation: about {} left", duration(left_s));
+            let (rate, left) = (flops_per_s / 1e9, duration(remaining_s));
+            let text = format!("{rate:.0} GFLOP/s; all stages and the evaluation: about {left} left");
             sink.event(&Event::Message(text));
         }
     };
