@@ -249,6 +249,7 @@ mod tests {
         };
         let message = find(&turned).unwrap_err().to_string();
         assert!(message.starts_with("scene 00ff has no baseline: its 3 camera centres"), "{message}");
+        assert!(message.contains("the method needs parallax") && message.contains("turns on a tripod"), "{message}");
         // The threshold is 4 f32 epsilons of a million: 0.477.
         let apart = |extent: f64| {
             let mut poses = turned;

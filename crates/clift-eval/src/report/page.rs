@@ -83,6 +83,7 @@ impl Report {
                             "clift evaluation, " (httpdate::fmt_http_date(SystemTime::now().max(UNIX_EPOCH)))
                             @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
                         }
+                        @if let Some(note) = self.summary.masked_note() { p.note { (note) } }
                         @for warning in self.summary.warnings() { p.warning { "Warning: " (text(&warning)) } }
                         (self.quality_and_cost())
                         (tables::points(&self.summary))

@@ -188,6 +188,12 @@ impl Summary {
         }
     }
 
+    /// Says how many target pixels are masked, if some are.
+    pub(crate) fn masked_note(&self) -> Option<String> {
+        self.masked_share
+            .map(|share| format!("{:.1} % of the target pixels are masked and do not count", 100.0 * share))
+    }
+
     /// Returns warnings about figures that mislead.
     pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
         let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);

@@ -38,8 +38,8 @@ impl fmt::Display for Summary {
         let [views, scenes, skipped] = [(*num_views, "view"), (*num_scenes, "scene"), (*num_skipped, "scene")]
             .map(|(count, noun)| plural(count, noun));
         writeln!(f, "{views} of {scenes}{split}, {skipped} skipped")?;
-        if let Some(share) = self.masked_share {
-            writeln!(f, "{:.1} % of the target pixels are masked and do not count", 100.0 * share)?;
+        if let Some(note) = self.masked_note() {
+            writeln!(f, "{note}")?;
         }
         for warning in self.warnings() {
             writeln!(f, "warning: {warning}")?;

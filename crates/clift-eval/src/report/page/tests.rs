@@ -136,7 +136,9 @@ fn pages_without_selections_or_points_explain_the_gap() {
     let mut plain = report();
     plain.summary.points.retain(|point| point.key.is_whole());
     plain.figures[0].selections.clear();
+    plain.summary.masked_share = Some(0.25);
     let html = page(&plain);
+    assert!(html.contains("25.0 % of the target pixels are masked"), "{html}");
     assert!(html.contains("--render 1/4,1/2") && !html.contains("Quality against rendered tokens"));
     plain.summary.points.clear();
     plain.figures.clear();
