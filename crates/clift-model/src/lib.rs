@@ -72,6 +72,7 @@ pub use ops::precision::Precision;
 // Images and cameras
 pub use views::patch::{patchify, unpatchify};
 pub use views::patch_grids::PatchGrids;
+pub use views::rays::RayFrame;
 pub use views::rays::plucker;
 pub use views::upload::{Cameras, Views, upload_images};
 // Tokens: counts, clusters, selection
@@ -84,7 +85,7 @@ pub use tokens::selection::rules::{SelectionPreset, SelectionRules};
 pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 // Networks
-pub use network::architecture::{Architecture, CameraEncoding, CliftVariant, RayFrame};
+pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
 pub use network::camera_encoding::TokenTransforms;
 pub use network::config::{CondenserConfig, ModelConfig};
 pub use network::init::Init;

@@ -54,9 +54,8 @@ fn evaluated(
     let [stored, rendered] = [num_tokens, num_render_tokens].map(|count| count.to_string());
     let text = place.text(&format!("{eval}/views.csv"));
     let rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
-    let is_it = |row: &Vec<&str>| {
-        row[0] == KEY && row[2..5] == ["clift", &stored, &rendered] && row.last() == Some(&format.name())
-    };
+    let is_it =
+        |row: &Vec<&str>| row[0] == KEY && row[2..5] == ["clift", &stored, &rendered] && row[11] == format.name();
     let rows = rows.filter(is_it);
     rows.map(|row| (row[5].parse().expect("a number"), row[6].parse().expect("a number"))).collect()
 }

@@ -5,8 +5,9 @@ use std::fmt::Display;
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
-use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant, RayFrame};
+use crate::network::architecture::{Architecture, CameraEncoding, CliftVariant};
 use crate::views::patch_grids::PatchGrids;
+use crate::views::rays::RayFrame;
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are those of the network's paper, with six blocks each
 /// in encoder and renderer.

@@ -7,7 +7,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
 use crate::error::ModelError;
-use crate::network::architecture::{CameraEncoding, CliftVariant, RayFrame};
+use crate::network::architecture::{CameraEncoding, CliftVariant};
 use crate::network::blocks::block::EncoderBlock;
 use crate::network::blocks::pixels::{decode_image, embed_context, embed_rays};
 use crate::network::camera_encoding::TokenTransforms;
@@ -20,6 +20,7 @@ use crate::network::layers::{
 };
 use crate::network::render_tokens::KeyValueCache;
 use crate::views::patch_grids::PatchGrids;
+use crate::views::rays::RayFrame;
 use crate::views::upload::{Cameras, Views};
 
 /// LVSM's encoder-decoder, of its paper or of `CLiFT`'s release.

@@ -110,13 +110,14 @@ mod tests {
     use clift_core::{Camera, ClipViews, DMat3, Intrinsics, Pose};
 
     use super::*;
-    use crate::network::architecture::{CameraEncoding, CliftVariant, RayFrame};
+    use crate::network::architecture::{CameraEncoding, CliftVariant};
     use crate::network::pass::Pass;
     use crate::ops::precision::Precision;
     use crate::testing::{
         Fixture, assert_close, devices, error_norms, gradient_pairs, load_weights, random, small_lvsm, to_vec,
         weight_gradients,
     };
+    use crate::views::rays::RayFrame;
 
     fn small(config: ModelConfig) -> ModelConfig {
         ModelConfig {

@@ -3,8 +3,33 @@
 
 use burn::tensor::{Int, Tensor, assert_shape};
 
-use crate::network::architecture::RayFrame;
+use serde::{Deserialize, Serialize};
+use strum::Display;
+
 use crate::views::upload::Cameras;
+
+/// Frame of the rays that are inputs of the networks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display)]
+#[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
+pub enum RayFrame {
+    /// Plücker coordinates in the frame of the scene (paper section 3.1).
+    #[default]
+    World,
+    /// Directions in the frame of the view's own camera ("`CamRay`" of `PRoPE`, arXiv 2507.10496). With camera-relative
+    /// attention a network then depends on relative poses alone.
+    Camera,
+}
+
+impl RayFrame {
+    /// Returns the number of coordinates of a ray.
+    pub(crate) fn num_coordinates(self) -> usize {
+        match self {
+            Self::World => 6,
+            Self::Camera => 3,
+        }
+    }
+}
 
 /// Computes the ray of every pixel in the frame of the scene ([`plucker`]) or of its camera.
 ///

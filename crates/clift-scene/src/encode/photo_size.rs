@@ -3,17 +3,22 @@
 /// Largest ratio of the sides of an image; longer photos are cropped.
 const MAX_ASPECT: f64 = 2.0;
 
+/// What a pixel less than in training counts, beside the logarithm of the ratio of the proportions.
+const AREA_WEIGHT: f64 = 0.5;
+
 /// Returns width and height of images that show nearly all of a photo of `photo` pixels: multiples of the patch in about the
-/// proportions of the photo, with at most as many pixels as the `trained` size.
+/// proportions of the photo, with about as many pixels as the `trained` size, and no more.
 pub fn photo_size(trained: [usize; 2], patch_size: usize, photo: [usize; 2]) -> [usize; 2] {
-    let area = (trained[0] * trained[1]) as f64;
-    let aspect = (photo[0] as f64 / photo[1].max(1) as f64).clamp(1.0 / MAX_ASPECT, MAX_ASPECT);
-    let patches = |side: f64| ((side / patch_size as f64).round() as usize).max(1);
-    let shorter = patches((area * aspect.min(aspect.recip())).sqrt());
-    // The patches of all images together are as many as the network was trained with, or fewer.
-    let most = (area as usize / (patch_size * patch_size)) / shorter;
-    let longer = patches((shorter * patch_size) as f64 * aspect.max(aspect.recip())).clamp(shorter.min(most), most);
-    let [longer, shorter] = [longer, shorter].map(|count| count * patch_size);
+    let most = (trained[0] / patch_size * (trained[1] / patch_size)).max(1);
+    let aspect = (photo[0].max(1) as f64 / photo[1].max(1) as f64).clamp(1.0 / MAX_ASPECT, MAX_ASPECT);
+    let longer_by = aspect.max(aspect.recip());
+    let sizes = (1..=most.isqrt()).map(|shorter| {
+        let longer = ((shorter as f64 * longer_by).round() as usize).clamp(shorter, most / shorter);
+        let difference = (longer as f64 / shorter as f64 / longer_by).ln().abs();
+        let cost = difference + AREA_WEIGHT * (1.0 - (longer * shorter) as f64 / most as f64);
+        (cost, [longer, shorter].map(|count| count * patch_size))
+    });
+    let (_, [longer, shorter]) = sizes.min_by(|a, b| a.0.total_cmp(&b.0)).expect("at least one size");
     if aspect >= 1.0 { [longer, shorter] } else { [shorter, longer] }
 }
 

@@ -57,7 +57,7 @@ pub struct EncodeArgs {
     /// Encode this frame and those nearest to it, as one group
     #[arg(long, value_name = "FRAME", conflicts_with = "groups")]
     pub near: Option<String>,
-    /// Part of each photo to encode: whole, or the middle with the proportions of the training images
+    /// Part of each photo to encode
     ///
     /// Networks trained with a single image size always have the middle.
     #[arg(long, value_name = "PART", value_enum, default_value_t)]

@@ -5,10 +5,9 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
 
-use crate::network::architecture::RayFrame;
 use crate::ops::linear::{linear_in_f32, norm_linear};
 use crate::views::patch::{patchify, unpatchify};
-use crate::views::rays::rays;
+use crate::views::rays::{RayFrame, rays};
 use crate::views::upload::Cameras;
 
 /// Embeds colours and rays of context patches.

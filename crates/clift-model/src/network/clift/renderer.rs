@@ -4,7 +4,6 @@ use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
-use crate::network::architecture::RayFrame;
 use crate::network::blocks::block::DecoderBlock;
 use crate::network::blocks::pixels::{decode_image, embed_rays};
 use crate::network::camera_encoding::{TokenTransforms, TransformMaker};
@@ -13,6 +12,7 @@ use crate::network::design::{Patches, RendererBlocks};
 use crate::network::init::Init;
 use crate::network::render_tokens::{KeyValueCache, RenderTokens};
 use crate::views::patch_grids::PatchGrids;
+use crate::views::rays::RayFrame;
 use crate::views::upload::Cameras;
 
 /// A transformer decoder whose queries are the ray patches of a target view.
