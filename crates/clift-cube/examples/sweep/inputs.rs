@@ -6,39 +6,50 @@ use clift_cube::{Buffer, Values};
 use cubecl::prelude::Client;
 use half::f16;
 
-/// A buffer of values in [-scale, scale], uploaded when it is first used.
-pub struct Input {
+/// Values that a thread makes.
+const PART: usize = 1 << 21;
+
+/// Random values in [-scale, scale].
+#[derive(Clone, Copy)]
+struct Random {
     seed: u64,
-    len: usize,
     scale: f32,
-    /// Type of the buffer.
-    pub values: Values,
-    /// Rounds values to f16, whatever the type of the buffer.
+    /// Rounds values to f16.
     is_rounded: bool,
+}
+
+impl Random {
+    fn at(self, i: usize) -> f32 {
+        let value = self.scale * ((hash(self.seed, i) >> 40) as f32 / (1 << 23) as f32 - 1.0);
+        if self.is_rounded { f16::from_f32(value).to_f32() } else { value }
+    }
+}
+
+/// Random values, and their buffer once it is used.
+pub struct Input {
+    random: Random,
+    len: usize,
+    values: Values,
     buffer: OnceCell<Buffer>,
 }
 
 impl Input {
     pub fn new(seed: u64, len: usize) -> Self {
-        Self { seed, len, scale: 1.0, values: Values::F32, is_rounded: false, buffer: OnceCell::new() }
+        let random = Random { seed, scale: 1.0, is_rounded: false };
+        Self { random, len, values: Values::F32, buffer: OnceCell::new() }
     }
 
     pub fn scaled(self, scale: f32) -> Self {
-        Self { scale, ..self }
+        Self { random: Random { scale, ..self.random }, ..self }
     }
 
     /// Rounds values to f16, in a buffer of type `values`.
     pub fn rounded(self, values: Values) -> Self {
-        Self { values, is_rounded: true, ..self }
-    }
-
-    fn value(&self, i: usize) -> f32 {
-        let value = self.scale * ((hash(self.seed, i) >> 40) as f32 / (1 << 23) as f32 - 1.0);
-        if self.is_rounded { f16::from_f32(value).to_f32() } else { value }
+        Self { random: Random { is_rounded: true, ..self.random }, values, ..self }
     }
 
     pub fn at(&self, i: usize) -> f64 {
-        f64::from(self.value(i))
+        f64::from(self.random.at(i))
     }
 
     /// Returns `len` values from `start`.
@@ -48,12 +59,23 @@ impl Input {
 
     pub fn buffer(&self, client: &Client) -> &Buffer {
         self.buffer.get_or_init(|| {
-            let values = (0..self.len).map(|i| self.value(i));
-            let bytes: Vec<u8> = match self.values {
-                Values::F32 => values.flat_map(f32::to_le_bytes).collect(),
-                Values::F16 => values.flat_map(|x| f16::from_f32(x).to_le_bytes()).collect(),
-            };
-            Buffer { handle: client.create_from_slice(&bytes), len: self.len, values: self.values }
+            let &Self { random, len, values, .. } = self;
+            let width = if values == Values::F32 { 4 } else { 2 };
+            let mut bytes = vec![0; len * width];
+            std::thread::scope(|scope| {
+                for (part, bytes) in bytes.chunks_mut(PART * width).enumerate() {
+                    scope.spawn(move || {
+                        for (i, bytes) in bytes.chunks_exact_mut(width).enumerate() {
+                            let value = random.at(part * PART + i);
+                            match values {
+                                Values::F32 => bytes.copy_from_slice(&value.to_le_bytes()),
+                                Values::F16 => bytes.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
+                            }
+                        }
+                    });
+                }
+            });
+            Buffer { handle: client.create_from_slice(&bytes), len, values }
         })
     }
 }

@@ -56,7 +56,10 @@ fn main() {
         _ => panic!("build with `--features spirv`"),
     };
     let class = AdapterClass::of(&client);
-    println!("{{\"adapter\":\"{}\",\"compiler\":\"{compiler}\",\"class\":\"{class:?}\"}}", client.name());
+    println!(
+        "{{\"adapter\":\"{}\",\"compiler\":\"{compiler}\",\"class\":\"{class:?}\"}}",
+        client.properties().identity.name
+    );
     let sizes = if size == "full" { Sizes::FULL } else { Sizes::TINY };
     run(&mut Sweep::new(&client, first), class, sizes);
 }
