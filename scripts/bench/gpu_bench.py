@@ -40,6 +40,8 @@ CANDIDATE_S = 20.0
 # Failures in a row after which a compiler is given up: the device or the driver does not work.
 MAX_FAILURES = 5
 STEPS = 50
+# The time of the first use includes compiling in every process: drivers keep nothing on disk.
+NO_SHADER_CACHE = {"__GL_SHADER_DISK_CACHE": "0", "MESA_SHADER_CACHE_DISABLE": "true"}
 # The precision of training.
 PRECISION = {"SPIR-V": "f16", "WGSL": "f32"}
 
@@ -152,7 +154,7 @@ class Sweep:
                     break
                 if rows and rows[-1].get("state") == "starts":
                     del rows[-1]["state"]
-                    rows[-1]["failed"] = error
+                    rows[-1]["failed"] = error if self.left(end_) > 0 else "the time was over"
                 failures = 1 if len(rows) > done + 1 else failures + 1
                 if len(rows) == done:
                     self.fail(f"kernels, {compiler}", error)
@@ -172,9 +174,9 @@ class Sweep:
             if len(lines) > seen:
                 seen, since = len(lines), time.monotonic()
                 objects = [json.loads(line) for line in lines if line.startswith("{")]
-                self.report["adapter " + compiler] = objects[0]
+                self.report |= {f"adapter, {compiler}": one for one in objects if "adapter" in one}
                 # The results of a candidate replace its start.
-                rows[done:] = {row["index"]: row for row in objects[1:]}.values()
+                rows[done:] = {one["index"]: one for one in objects if "index" in one}.values()
                 self.save()
             return time.monotonic() - since < CANDIDATE_S * (3 if self.args.tiny else 1)
 
@@ -240,7 +242,8 @@ class Sweep:
     def train(self, end: float) -> None:
         """Steps of re10k.toml with one micro-batch of four scenes each, by the first binary whose updates work."""
         clifts = [(f"clift {compiler} {PRECISION[compiler]}", compiler, path) for compiler, path in self.binaries()]
-        broken = [row["side"] for row in self.report.get("updates", []) if row["work"] == "stage1_step" and "failed" in row]
+        updates = [row for row in self.report.get("updates", []) if row["work"] == "stage1_step"]
+        broken = [row["side"] for row in updates if "failed" in row]
         name, compiler, clift = next((one for one in clifts if one[0] not in broken), clifts[-1])
         keys = [f'run_dir="{self.folder / "run"}"', f'precision="{PRECISION[compiler]}"', f"stage1.steps={STEPS}"]
         keys += ["stage1.batch_size=4", "stage1.accumulate=1", "loss.perceptual_weight=0.0"]
@@ -310,7 +313,7 @@ def seconds(value: float) -> str:
 
 
 def table(head: list[str], lines: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(line) + " |" for line in [head, ["---"] * len(head), *lines])
+    return "\n".join("|" + "|".join(line) + "|" for line in [head, ["---"] * len(head), *lines])
 
 
 def is_wrong(row: Values) -> bool:
@@ -319,33 +322,39 @@ def is_wrong(row: Values) -> bool:
     return row["error"] is None or row["error"] > limit
 
 
-def kernel_table(rows: list[Values]) -> str:
-    """The fastest right candidate of every kernel and shape."""
-    groups: dict[tuple[str, str, bool], list[Values]] = {}
-    for row in rows:
-        groups.setdefault((row["kernel"], row["case"], "planes" in row["tile"]), []).append(row)
+def kernel_table(compilers: dict[str, list[Values]]) -> str:
+    """The fastest right candidate of every kernel and shape; with WGSL its times alone."""
+    groups: dict[tuple[str, str, bool], dict[str, list[Values]]] = {}
+    for compiler, rows in compilers.items():
+        for row in rows:
+            key = (row["kernel"], row["case"], "planes" in row["tile"])
+            groups.setdefault(key, {}).setdefault(compiler, []).append(row)
     lines = []
     for (kernel, case, _), group in groups.items():
-        measured = [row for row in group if "ms" in row]
-        right = sorted((row for row in measured if not is_wrong(row)), key=lambda row: row["ms"])
-        counts = f"{len(right)} of {len(group)}"
-        if len(measured) > len(right):
-            counts += f", {len(measured) - len(right)} WRONG"
-        if right:
-            best = right[0]
-            figures = [f"{best['ms']:.3g}", f"{best['rate']:.3g} {best['unit']}", f"{best['error']:.0e}"]
-            lines.append([kernel, case, best["tile"], *figures, f"{best['first_ms'] / 1e3:.2f}", counts])
-        else:
-            lines.append([kernel, case, *["-"] * 5, counts])
-    return table(["kernel", "shape", "best tile", "ms", "rate", "error", "first use, s", "right"], lines)
+        line = [kernel, case]
+        for compiler in ("spirv", "wgsl"):
+            rows = group.get(compiler, [])
+            measured = [row for row in rows if "ms" in row]
+            right = [row for row in measured if not is_wrong(row)]
+            counts = f"{len(right)}/{len(rows)}" if rows else "-"
+            counts += f" {len(measured) - len(right)} WRONG" if len(measured) > len(right) else ""
+            cells = ["-"] * 5
+            if right:
+                best = min(right, key=lambda row: row["ms"])
+                rate = f"{best['rate']:.3g} {best['unit']}"
+                cells = [best["tile"], f"{best['ms']:.3g}", rate, f"{best['error']:.0e}", f"{best['first_ms'] / 1e3:.1f}"]
+            line += [*cells, counts] if compiler == "spirv" else [cells[1], cells[4], counts]
+        lines.append(line)
+    head = ["kernel", "shape", "tile, SPIR-V", "ms", "rate", "error", "first, s", "right"]
+    return table([*head, "ms, WGSL", "first, s", "right"], lines)
 
 
 def update_table(rows: list[Values]) -> str:
     sides = list(dict.fromkeys(row["side"] for row in rows))
     lines = []
     for work in dict.fromkeys(row["work"] for row in rows):
-        cells = {row["side"]: row for row in rows if row["work"] == work}
-        text = {side: f"{seconds(row['median_s'])} ({seconds(row['first_s'])})" for side, row in cells.items() if "median_s" in row}
+        done = [row for row in rows if row["work"] == work and "median_s" in row]
+        text = {row["side"]: f"{seconds(row['median_s'])} ({seconds(row['first_s'])})" for row in done}
         lines.append([work, *(text.get(side, "failed") for side in sides)])
     return table(["work: median (first)", *sides], lines)
 
@@ -369,9 +378,8 @@ def summary(report: Values) -> str:
     for compiler, text in report.get("doctor", {}).items():
         rows = [line for line in text.splitlines() if line.startswith(("wgpu", "flex", "device"))]
         parts.append(f"clift doctor, {compiler}:\n" + "\n".join(rows or [text.strip()[-300:]]))
-    for compiler, rows in report.get("kernels", {}).items():
-        if rows:
-            parts.append(f"Kernels, {compiler}:\n{kernel_table(rows)}")
+    if any(report.get("kernels", {}).values()):
+        parts.append(kernel_table(report["kernels"]))
     if report.get("updates"):
         parts.append(update_table(report["updates"]))
     if "train" in report:
@@ -396,6 +404,7 @@ def parse_arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = parse_arguments()
+    os.environ |= NO_SHADER_CACHE
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         sweep = Sweep(args, Path(folder))
         for part, end in PARTS.items():

@@ -57,8 +57,9 @@ impl<'a> Sweep<'a> {
         match &measured {
             Ok(fields) => line.push_str(fields),
             Err(error) => {
-                let error: String =
-                    error.chars().filter(|c| !c.is_control() && !"\"\\".contains(*c)).take(300).collect();
+                let readable = |c: char| if c.is_control() || "\"\\".contains(c) { ' ' } else { c };
+                let readable = |c: char| if c.is_control() || "\"\\".contains(c) { ' ' } else { c };
+                let error: String = error.chars().map(readable).take(600).collect();
                 write!(line, ",\"failed\":\"{error}\"").expect("a string grows");
             }
         }
