@@ -66,7 +66,7 @@ pack() {
     cp "$here/../../configs/tiny.toml" "$folder/sizes.toml"
     cp "$here/../../configs/re10k.toml" "$folder/"
     tar -C "$folder" -c . | xz -T1 --x86 --lzma2=preset=9 >"$folder.tar.xz"
-    size=$(($(stat -c %s "$folder.tar.xz") / 1000000))
+    size=$((($(stat -c %s "$folder.tar.xz") + 999999) / 1000000))
     if [ "$size" -gt "$max_mb" ]; then
         echo "$folder.tar.xz has $size MB, at most $max_mb are accepted: pack fewer chunks, or leave out a binary (CLIFT=)" >&2
         du -sh "$folder"/* >&2
@@ -93,7 +93,7 @@ pack) pack "${2:?a folder to pack into}" "${3:-}" ;;
 over) over "${2:?USER@HOST}" "${@:3}" ;;
 run) exec "${PYTHON:-python3}" "$here/gpu_bench.py" "${@:2}" ;;
 *)
-    sed -n '2,14p' "$0"
+    sed -n '2,12p' "$0"
     exit 2
     ;;
 esac
