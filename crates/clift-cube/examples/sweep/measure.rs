@@ -58,7 +58,6 @@ impl<'a> Sweep<'a> {
             Ok(fields) => line.push_str(fields),
             Err(error) => {
                 let readable = |c: char| if c.is_control() || "\"\\".contains(c) { ' ' } else { c };
-                let readable = |c: char| if c.is_control() || "\"\\".contains(c) { ' ' } else { c };
                 let error: String = error.chars().map(readable).take(600).collect();
                 write!(line, ",\"failed\":\"{error}\"").expect("a string grows");
             }
