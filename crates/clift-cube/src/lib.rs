@@ -9,7 +9,7 @@
 //! - `products`: products in f32 registers or cooperative matrices, and the table of their tiles
 //! - `attention`: attention, attention inside clusters, transforms of heads by cameras
 //!
-//! `examples/sweep.rs` times the tiles of the table.
+//! `examples/sweep` times candidate tiles.
 #![cfg(feature = "wgpu")]
 #![expect(
     clippy::collapsible_if,
@@ -31,8 +31,8 @@ mod testing;
 
 pub use adapter::{AdapterClass, MatrixShape};
 pub use attention::attention::{
-    AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward, attention_backward_tile,
-    attention_forward, attention_forward_tile,
+    AttentionGradients, AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward,
+    attention_backward_tile, attention_forward, attention_forward_tile,
 };
 pub use attention::cluster_attention::{ClusterSizes, cluster_attention_backward, cluster_attention_forward};
 pub use attention::head_transform::{PartTransform, transform_heads};

@@ -179,6 +179,17 @@ pub struct AttentionResults<'a> {
     pub grad_output: &'a Buffer,
 }
 
+/// Gradients that a backward writes, each by a kernel of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum AttentionGradients {
+    /// Gradients of the queries.
+    Queries,
+    /// Gradients of keys and values.
+    KeysAndValues,
+    /// Both.
+    All,
+}
+
 /// Writes the gradients of queries, keys and values to the rows of `grads`, in f32; keys and values share a buffer.
 pub fn attention_backward(
     client: &Client,
@@ -188,10 +199,10 @@ pub fn attention_backward(
     grads: &AttentionInputs,
 ) {
     let [_, backward] = AdapterClass::of(client).attention_tiles(sizes.operands, sizes.head_width);
-    attention_backward_tile(client, sizes, inputs, results, grads, backward);
+    attention_backward_tile(client, sizes, inputs, results, grads, backward, AttentionGradients::All);
 }
 
-/// Computes [`attention_backward`] with a tile of cooperative matrices, or with register tiles.
+/// Computes some gradients of [`attention_backward`] with a tile of cooperative matrices, or with register tiles.
 pub fn attention_backward_tile(
     client: &Client,
     sizes: AttentionSizes,
@@ -199,6 +210,7 @@ pub fn attention_backward_tile(
     results: AttentionResults,
     grads: &AttentionInputs,
     tile: Option<AttentionTile>,
+    gradients: AttentionGradients,
 ) {
     let AttentionSizes { batch, num_heads, num_queries, num_keys, head_width, .. } = sizes;
     let halves = tile.map(|_| in_f16(client, inputs.buffers()));
@@ -226,57 +238,61 @@ pub fn attention_backward_tile(
     let (scale, elems) = (sizes.scale(), [query.buffer, grad_output.buffer].map(|x| x.values.elem()));
     // SAFETY: the kernels read and write inside the counts of the rows.
     unsafe {
-        launch!(
-            tile,
-            backward_by_queries,
-            client,
-            sizes,
-            num_queries,
-            vector,
-            [
-                query.buffer.arg(vector),
-                key.buffer.arg(vector),
-                value.buffer.arg(vector),
-                grad_output.buffer.arg(vector),
-                results.log_sum.arg(1),
-                delta.arg(1),
-                grads.query.buffer.arg(vector),
-                rows(query, num_queries),
-                rows(key, num_keys),
-                rows(value, num_keys),
-                rows(&grad_output, num_queries),
-                rows(&grads.query, num_queries),
-                num_heads,
-                scale
-            ],
-            elems
-        );
-        launch!(
-            tile,
-            backward_by_keys,
-            client,
-            sizes,
-            num_keys,
-            vector,
-            [
-                query.buffer.arg(vector),
-                key.buffer.arg(vector),
-                value.buffer.arg(vector),
-                grad_output.buffer.arg(vector),
-                results.log_sum.arg(1),
-                delta.arg(1),
-                grads.key.buffer.arg(vector),
-                rows(query, num_queries),
-                rows(key, num_keys),
-                rows(value, num_keys),
-                rows(&grad_output, num_queries),
-                rows(&grads.key, num_keys),
-                rows(&grads.value, num_keys),
-                num_heads,
-                scale
-            ],
-            elems
-        );
+        if gradients != AttentionGradients::KeysAndValues {
+            launch!(
+                tile,
+                backward_by_queries,
+                client,
+                sizes,
+                num_queries,
+                vector,
+                [
+                    query.buffer.arg(vector),
+                    key.buffer.arg(vector),
+                    value.buffer.arg(vector),
+                    grad_output.buffer.arg(vector),
+                    results.log_sum.arg(1),
+                    delta.arg(1),
+                    grads.query.buffer.arg(vector),
+                    rows(query, num_queries),
+                    rows(key, num_keys),
+                    rows(value, num_keys),
+                    rows(&grad_output, num_queries),
+                    rows(&grads.query, num_queries),
+                    num_heads,
+                    scale
+                ],
+                elems
+            );
+        }
+        if gradients != AttentionGradients::Queries {
+            launch!(
+                tile,
+                backward_by_keys,
+                client,
+                sizes,
+                num_keys,
+                vector,
+                [
+                    query.buffer.arg(vector),
+                    key.buffer.arg(vector),
+                    value.buffer.arg(vector),
+                    grad_output.buffer.arg(vector),
+                    results.log_sum.arg(1),
+                    delta.arg(1),
+                    grads.key.buffer.arg(vector),
+                    rows(query, num_queries),
+                    rows(key, num_keys),
+                    rows(value, num_keys),
+                    rows(&grad_output, num_queries),
+                    rows(&grads.key, num_keys),
+                    rows(&grads.value, num_keys),
+                    num_heads,
+                    scale
+                ],
+                elems
+            );
+        }
     }
 }
 

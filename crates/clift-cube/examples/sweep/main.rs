@@ -1,0 +1,115 @@
+//! Times candidate tiles of every kernel on the shapes of the full-size network, and compares sampled outputs with f64:
+//! `sweep spirv full` (or `wgsl`, or `tiny` for software Vulkan), then optionally the first candidate to run.
+//!
+//! Prints JSON objects, one a line: the adapter; for every candidate its number and name before it runs, and its results
+//! after. A candidate that fails ends the process, whose device may be unusable: start again at the next number. The most
+//! valuable candidates come first. `scripts/bench/gpu_bench.py` does all that.
+
+mod attention;
+mod clusters;
+mod inputs;
+mod measure;
+mod products;
+mod rows;
+
+use clift_cube::{AdapterClass, AttentionTile, Values};
+use cubecl::device::{Device, RuntimeId, WgpuDeviceKind};
+use cubecl::prelude::Client;
+use cubecl::wgpu::{WgpuServer, WgslCompiler};
+
+use crate::attention::{Attention, Direction};
+use crate::measure::Sweep;
+use crate::products::{Layer, matrix_tiles, register_tiles};
+
+/// Sizes of a network and its batch.
+#[derive(Clone, Copy)]
+struct Sizes {
+    batch: usize,
+    /// Context tokens of a scene.
+    tokens: usize,
+    /// Patches of a target.
+    queries: usize,
+    num_heads: usize,
+    head_width: usize,
+    feed_forward: usize,
+}
+
+impl Sizes {
+    const FULL: Self = Self { batch: 4, tokens: 4096, queries: 1024, num_heads: 8, head_width: 96, feed_forward: 2048 };
+    /// Software Vulkan compiles wide cooperative matrices for minutes.
+    const TINY: Self = Self { batch: 2, tokens: 128, queries: 48, num_heads: 2, head_width: 16, feed_forward: 72 };
+
+    fn dim(self) -> usize {
+        self.num_heads * self.head_width
+    }
+}
+
+fn main() {
+    let mut arguments = std::env::args().skip(1);
+    let mut next = || arguments.next();
+    let (compiler, size) = (next().expect("spirv or wgsl"), next().expect("full or tiny"));
+    let first = next().map_or(0, |text| text.parse().expect("the number of a candidate"));
+    let device = Device::wgpu(WgpuDeviceKind::DefaultDevice).expect("an adapter");
+    let (client, class) = match compiler.as_str() {
+        // The adapter may have cooperative matrices: then kernels with them run, and their results are wrong.
+        "wgsl" => (Client::load::<WgpuServer<WgslCompiler>>(RuntimeId::strip(device.to_id())), AdapterClass::Registers),
+        _ if cfg!(feature = "spirv") => {
+            let client = device.client();
+            let class = AdapterClass::of(&client);
+            (client, class)
+        }
+        _ => panic!("build with `--features spirv`"),
+    };
+    println!(
+        "{{\"adapter\":\"{}\",\"compiler\":\"{compiler}\",\"class\":\"{class:?}\"}}",
+        client.properties().identity.name
+    );
+    let sizes = if size == "full" { Sizes::FULL } else { Sizes::TINY };
+    run(&mut Sweep::new(&client, first), class, sizes);
+}
+
+/// Runs all candidates. Kernels are compiled once for all shapes: the later shapes take little time.
+fn run(sweep: &mut Sweep, class: AdapterClass, sizes: Sizes) {
+    let shape = if let AdapterClass::Matrices(shape) = class { Some(shape) } else { None };
+    let (matrices, registers) = (matrix_tiles(shape), register_tiles());
+    // Planes, and columns in matrices.
+    let attention_tiles = shape.into_iter().flat_map(|shape| {
+        let width = sizes.head_width;
+        [(8, 2), (4, 2), (8, 1), (4, 4), (2, 2)]
+            .map(|(planes, columns)| Some(AttentionTile { shape, planes, columns: columns * shape.sizes[0], width }))
+    });
+    let attention_tiles: Vec<Option<AttentionTile>> = attention_tiles.collect();
+    let layers = Layer::all(sizes);
+    let attentions = [[sizes.tokens; 2], [sizes.queries, sizes.tokens], [sizes.queries; 2]];
+    let attentions = attentions.map(|counts| Attention::new(sizes, counts));
+
+    let [_, input, weight] = layers[0].products();
+    let [forward, ..] = layers[0].products();
+    forward.run(sweep, &matrices, Values::F32);
+    forward.run(sweep, &matrices, Values::F16);
+    for direction in Direction::ALL {
+        attentions[0].run(sweep, &attention_tiles, direction);
+    }
+    input.run(sweep, &matrices, Values::F32);
+    weight.run(sweep, &matrices, Values::F32);
+    rows::run(sweep, sizes);
+    clusters::run(sweep, sizes);
+    for product in layers[0].products() {
+        product.run(sweep, &registers, Values::F32);
+    }
+    for direction in Direction::ALL {
+        attentions[0].run(sweep, &[None], direction);
+    }
+    input.run(sweep, &matrices, Values::F16);
+    weight.run(sweep, &matrices, Values::F16);
+    for product in layers[1..].iter().flat_map(Layer::products) {
+        product.run(sweep, &matrices, Values::F32);
+        product.run(sweep, &registers, Values::F32);
+    }
+    for attention in &attentions[1..] {
+        for direction in Direction::ALL {
+            attention.run(sweep, &attention_tiles, direction);
+            attention.run(sweep, &[None], direction);
+        }
+    }
+}
