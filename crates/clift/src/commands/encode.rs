@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{ClipReader, Split, plural};
-use clift_model::{TokenCount, TokenKind};
+use clift_data::{ClipReader, Split};
+use clift_model::TokenCount;
 use clift_scene::{
-    CheckedView, ClusterMap, Coding, ContextChoice, EncodeOptions, EncodedScene, MIN_CONTEXT_PSNR, Scene, SceneError,
-    SceneOptions, TokenCoding, WrittenScene, check_output_path, encode_scene, find_scene, frame_positions,
+    ClusterMap, Coding, ContextChoice, EncodeOptions, Scene, SceneError, SceneOptions, TokenCoding, check_output_path,
+    encode_scene, find_scene, frame_positions,
 };
 
 use crate::commands::args::model_args::{ModelArgs, PhotoCrop};
@@ -14,13 +14,7 @@ use crate::commands::args::parse::{parse_hold_out, parse_kb, parse_loss, parse_o
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::output_file::OutputFile;
-use crate::output::stdout::{print_note, print_result, print_warning};
-use crate::output::units::file_size;
-
-/// Most frames of a list.
-const MAX_LISTED: usize = 8;
-/// Most held-out frames with a line of their own.
-const MAX_LISTED_CHECKS: usize = 16;
+use crate::output::written_scene::print_scene;
 
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
@@ -150,104 +144,6 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     if let Some(file) = clusters {
         file.write_json(&ClusterMap::new(&written.encoded))?;
     }
-    print(&written, &args.out, &model_args)
-}
-
-fn print(written: &WrittenScene, out: &Path, model: &ModelArgs) -> anyhow::Result<()> {
-    print_result(&describe(written, out))?;
-    if let (Some([width, height]), [w, h]) = (written.cropped, written.image_size) {
-        print_note(&format!("of images of {w} x {h}, the central {width} x {height} pixels are used"));
-    }
     // Contexts of a run's own data show how well it is trained, not how far apart they are.
-    print_contexts(written, model.folder.is_some())?;
-    match written.others[..] {
-        [] => Ok(()),
-        [CheckedView { frame, psnr, baseline_psnr }] => {
-            let frame = written.frame_name(frame);
-            print_result(&format!(
-                "check: frame {frame}, not a context: {psnr:.2} dB rendered, {baseline_psnr:.2} dB copied from the nearest \
-                 context"
-            ))?;
-            if psnr < baseline_psnr {
-                print_warning(format!(
-                    "the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
-                     from the training scenes of {}, few tokens are stored, or the run is not trained enough",
-                    model.given.display()
-                ));
-            }
-            Ok(())
-        }
-        ref views => {
-            let mean = |value: fn(&CheckedView) -> f64| {
-                clift_core::mean(&views.iter().map(value).collect::<Vec<_>>()).unwrap_or_default()
-            };
-            for view in views.iter().take(MAX_LISTED_CHECKS) {
-                let name = written.frame_name(view.frame);
-                print_result(&format!("  {name}: {:.2} dB, nearest context {:.2} dB", view.psnr, view.baseline_psnr))?;
-            }
-            print_result(&format!(
-                "check: {} frames held out: {:.2} dB rendered, {:.2} dB copied from the nearest context; {} rendered better",
-                views.len(),
-                mean(|view| view.psnr),
-                mean(|view| view.baseline_psnr),
-                views.iter().filter(|view| view.psnr > view.baseline_psnr).count()
-            ))
-        }
-    }
-}
-
-/// Prints how well the context views come out; of a capture, warns of fog.
-fn print_contexts(written: &WrittenScene, is_capture: bool) -> anyhow::Result<()> {
-    let psnrs: Vec<f64> = written.contexts.iter().map(|view| view.psnr).collect();
-    let fog: Vec<String> =
-        written.contexts.iter().filter(|view| view.is_fog()).map(|view| written.frame_name(view.frame)).collect();
-    print_result(&format!(
-        "check: the context views are rendered at {:.2} dB",
-        clift_core::mean(&psnrs).unwrap_or_default()
-    ))?;
-    if is_capture && !fog.is_empty() {
-        let more = if fog.len() > MAX_LISTED { ", .." } else { "" };
-        print_warning(format!(
-            "{} of {} context views are rendered below {MIN_CONTEXT_PSNR} dB or worse than the mean image, as fog: {}{more}; \
-             their neighbours are too far away: take more photos in between, encode one part of the place with --near PHOTO, \
-             or train on the capture (configs/capture.toml)",
-            fog.len(),
-            psnrs.len(),
-            fog[..fog.len().min(MAX_LISTED)].join(", ")
-        ));
-    }
-    Ok(())
-}
-
-fn describe(written: &WrittenScene, path: &Path) -> String {
-    let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = &written.encoded;
-    let num_tokens = scene.num_tokens();
-    let mut frames: Vec<String> =
-        scene.context_frames.iter().map(|&frame| written.frame_name(frame as usize)).collect();
-    if frames.len() > MAX_LISTED {
-        frames.splice(MAX_LISTED / 2..frames.len() - MAX_LISTED / 2, ["..".into()]);
-    }
-    let groups = match scene.groups.len() {
-        1 => String::new(),
-        count => format!(" in {count} groups"),
-    };
-    let clusters = match scene.kind {
-        TokenKind::All => String::new(),
-        _ => format!("\ntokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}"),
-    };
-    format!(
-        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {}), {}\nscene {}, {}{groups} of {} x {}: frames {}{clusters}",
-        path.display(),
-        scene.kind,
-        written.stored,
-        file_size(written.file_bytes),
-        scene.key,
-        match written.num_frames - scene.context.len() {
-            0 => plural(scene.context.len(), "view"),
-            _ => format!("{} of {}", scene.context.len(), plural(written.num_frames, "view")),
-        },
-        scene.width,
-        scene.height,
-        frames.join(", "),
-    )
+    print_scene(&written, &args.out, &given.display().to_string(), model_args.folder.is_some())
 }

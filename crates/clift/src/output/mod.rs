@@ -9,6 +9,7 @@
 //! - `plain`: progress lines for log files
 //! - `bar`: progress bar
 //! - `counter`: progress of counted work
+//! - `written_scene`: what `clift encode` wrote
 //! - `progress_sink`: bar, lines or nothing, by verbosity
 
 pub(crate) mod bar;
@@ -21,3 +22,4 @@ pub(crate) mod stdout;
 pub(crate) mod tensorboard;
 pub(crate) mod units;
 pub(crate) mod visible;
+pub(crate) mod written_scene;
