@@ -32,7 +32,7 @@ pub use encode::photo_size::photo_size;
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::frame_size::check_frames;
 pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{ContextGroup, MAX_JOINED_TOKENS, Scene, scene_file_bytes};
+pub use scene::scene::{ContextGroup, Scene, scene_file_bytes};
 pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, load_renderer};
 pub use scene::token_coding::{CodedLoss, TokenCoding};
 pub use scene::token_format::TokenFormat;

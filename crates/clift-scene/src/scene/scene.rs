@@ -32,8 +32,8 @@ use crate::scene::token_format::TokenFormat;
 /// Length of the header of a scene file in bytes.
 pub const HEADER_BYTES: usize = 2048;
 
-/// Most tokens of several groups that a view is rendered from: as many as those of the context views of a training scene.
-pub const MAX_JOINED_TOKENS: usize = 2048;
+/// Most context views whose tokens a view is rendered from, where groups are joined: as many as in training.
+pub(crate) const MAX_JOINED_VIEWS: usize = 8;
 
 pub(crate) const FORMAT: &str = "clift-scene";
 /// The version of files with plain tokens.
@@ -129,10 +129,24 @@ impl Scene {
     }
 
     /// Returns the most tokens that a view is rendered from at once: those of the largest group, or, of a network that joins
-    /// groups, [`MAX_JOINED_TOKENS`].
+    /// groups, those of the eight views with the most.
     pub fn max_render_tokens(&self) -> usize {
-        let largest = || self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default();
-        if self.model.joins_groups() { self.num_tokens().min(MAX_JOINED_TOKENS) } else { largest() }
+        if !self.model.joins_groups() {
+            return self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default();
+        }
+        let mut counts: Vec<usize> = self.tokens_of_members().iter().map(Vec::len).collect();
+        counts.sort_unstable_by(|a, b| b.cmp(a));
+        counts.iter().take(MAX_JOINED_VIEWS).sum()
+    }
+
+    /// Returns the positions of the tokens of every member of all groups, ascending.
+    pub(crate) fn tokens_of_members(&self) -> Vec<Vec<u32>> {
+        let patches = self.height / self.model.patch_size * (self.width / self.model.patch_size);
+        let mut tokens = vec![Vec::new(); self.num_members()];
+        for (token, &id) in self.token_ids.iter().enumerate() {
+            tokens[id as usize / patches].push(token as u32);
+        }
+        tokens
     }
 
     /// Returns the groups whose tokens views are rendered from, with the positions of their tokens: one of all context views

@@ -13,7 +13,7 @@ use clift_model::{
 
 use crate::scene::frame_size::{FramePlan, TrainedImage};
 use crate::scene::group_shares::group_shares;
-use crate::scene::scene::{ContextGroup, Scene};
+use crate::scene::scene::{ContextGroup, MAX_JOINED_VIEWS, Scene};
 
 /// Most images of one call, which share keys and values, and most frames that are rendered together.
 const IMAGES_PER_CALL: usize = 8;
@@ -93,6 +93,8 @@ struct TokenGroup {
     views: Vec<Pose>,
     /// Positions of the tokens in the scene.
     tokens: Vec<u32>,
+    /// Tokens of every view, where a view is rendered from those of the nearest few; empty otherwise.
+    of_views: Vec<Vec<u32>>,
     /// Keys and values of the tokens.
     cache: KeyValueCache,
     selector: Selector,
@@ -106,6 +108,7 @@ impl SceneRenderer {
     pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
         let (rays, dim) = (scene.token_rays(), scene.model.dim);
         let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
+        let is_joined = scene.model.joins_groups() && scene.num_members() > MAX_JOINED_VIEWS;
         let mut groups = Vec::with_capacity(scene.groups.len());
         let mut first_patch = 0;
         for (group, tokens) in scene.render_groups() {
@@ -123,6 +126,7 @@ impl SceneRenderer {
                 trained: TrainedImage::new(scene, &context),
                 cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
                 selector: Selector::new(rules, &rays)?,
+                of_views: if is_joined { scene.tokens_of_members() } else { Vec::new() },
                 tokens,
             });
         }
@@ -165,7 +169,8 @@ impl SceneRenderer {
     /// Renders the next frames of a path from the groups of tokens nearest to each: of every group from the
     /// `num_render_tokens` tokens nearest to the view, or all its tokens if it has no more. A frame between groups is a mean
     /// of their images with weights that change continuously along a path; of `num_render_tokens`, each group has its share.
-    /// A network that [joins groups](ModelConfig::joins_groups) has one group of all tokens.
+    /// A network that [joins groups](ModelConfig::joins_groups) has one group of all tokens; a frame is rendered from those of
+    /// the eight context views nearest to it.
     /// Frames of all tokens are rendered [`Self::frames_per_call`] at a time. A frame of another size or field of view than
     /// the context views is resampled from images like theirs: it keeps the field of view of its camera, and a larger one has
     /// no more detail.
@@ -181,8 +186,7 @@ impl SceneRenderer {
         width: usize,
         num_render_tokens: usize,
     ) -> Result<Vec<RenderedView>, ModelError> {
-        let num_render_tokens = num_render_tokens.min(self.max_render_tokens);
-        let selects = self.groups.iter().any(|group| num_render_tokens < group.tokens.len());
+        let selects = num_render_tokens < self.max_render_tokens;
         if selects && !self.has_patch_tokens {
             let fix = format!(
                 "learned tokens belong to no view, so that none can be selected by the camera: render from all {}",
@@ -195,7 +199,8 @@ impl SceneRenderer {
         for group in 0..self.groups.len() {
             let share = |frame: usize| shares[frame].iter().find(|(other, _)| *other == group).map(|(_, share)| *share);
             let frames: Vec<(usize, f64)> = (0..views.len()).filter_map(|frame| Some((frame, share(frame)?))).collect();
-            let per_call = if selects { 1 } else { frames_per_call(height, width) };
+            let is_alone = selects || !self.groups[group].of_views.is_empty();
+            let per_call = if is_alone { 1 } else { frames_per_call(height, width) };
             for frames in frames.chunks(per_call) {
                 let cameras: Vec<Camera> = frames.iter().map(|&(frame, _)| views[frame]).collect();
                 let count = (num_render_tokens as f64 * frames[0].1).ceil() as usize;
@@ -227,12 +232,14 @@ impl SceneRenderer {
         let plan = |view: &Camera| FramePlan::new(trained, view, size);
         let plans: Vec<FramePlan> =
             tokens.context.cameras(views.iter().copied()).iter().map(plan).collect::<Result<_, _>>()?;
-        let selected = match num_render_tokens {
-            Some(count) => {
-                let (view, [height, width]) = plans[0].whole();
-                Some(tokens.selector.select(&view, height, width, count)?)
+        let near = tokens.near(self.distance, &views[0].c2w);
+        let selected = match (num_render_tokens, near) {
+            (Some(count), near) if near.as_ref().is_none_or(|near| count < near.len()) => {
+                let (view, size) = plans[0].whole();
+                let is_near = near.map(|near| mask(&near, tokens.tokens.len())).unwrap_or_default();
+                Some(tokens.selector.select_among(&is_near, &view, size, count)?)
             }
-            None => None,
+            (_, near) => near,
         };
         let select_s = if selected.is_some() { started.elapsed().as_secs_f64() } else { 0.0 };
         let started = Instant::now();
@@ -281,6 +288,29 @@ impl SceneRenderer {
         let distances: Vec<f64> = self.groups.iter().map(|group| self.distance.to_group(view, &group.views)).collect();
         group_shares(&distances)
     }
+}
+
+impl TokenGroup {
+    /// Returns the tokens of the context views nearest to a view, ascending; `None` for all tokens.
+    fn near(&self, distance: ViewDistance, view: &Pose) -> Option<Vec<u32>> {
+        if self.of_views.is_empty() {
+            return None;
+        }
+        let to_view = |member: &usize| distance.between(&self.views[*member], view);
+        let mut members: Vec<usize> = (0..self.views.len()).collect();
+        members.sort_by(|a, b| to_view(a).total_cmp(&to_view(b)));
+        let mut near: Vec<u32> =
+            members[..MAX_JOINED_VIEWS].iter().flat_map(|&member| &self.of_views[member]).copied().collect();
+        near.sort_unstable();
+        Some(near)
+    }
+}
+
+/// Returns whether each of `count` tokens is among `tokens`.
+fn mask(tokens: &[u32], count: usize) -> Vec<bool> {
+    let mut mask = vec![false; count];
+    tokens.iter().for_each(|&token| mask[token as usize] = true);
+    mask
 }
 
 impl RenderedView {
@@ -447,6 +477,39 @@ mod tests {
             let error = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(error <= 1e-6, "{error} with {count} tokens");
             whole.reset();
+        }
+    }
+
+    #[test]
+    fn a_view_is_rendered_from_the_tokens_of_the_eight_nearest_views() {
+        let device = Device::flex();
+        let config = ModelConfig { rays: RayFrame::Camera, ..encoded(CameraEncoding::Gta) };
+        let renderer = Network::new(&config, 3, &device).renderer;
+        // Ten views in a row of 6 patches each, in five groups.
+        let context: Vec<Camera> = (0..10).map(|view| camera(0.2 * f64::from(view), 0.0)).collect();
+        let groups =
+            (0..5).map(|group| ContextGroup { views: vec![2 * group, 2 * group + 1], ..ContextGroup::of_all(0) });
+        let scene = Scene {
+            context_frames: (0..10).collect(),
+            groups: groups.collect(),
+            token_ids: (0..60).collect(),
+            tokens: (0..60 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect(),
+            model: config.clone(),
+            renderer_hash: renderer_hash(&renderer, &config),
+            context: context.clone(),
+            ..scene()
+        };
+        let rules = SelectionPreset::Paper.rules();
+        let mut renderer = SceneRenderer::new(&scene, renderer, rules, &device).unwrap();
+        assert_eq!((scene.max_render_tokens(), renderer.max_render_tokens()), (48, 48));
+        for (view, near) in [(context[0], 0..48_u32), (context[9], 12..60)] {
+            let mut tokens = |count: usize| {
+                renderer.reset();
+                renderer.render(&[view, view], 16, 24, count).unwrap().remove(0).tokens.unwrap()
+            };
+            assert_eq!(tokens(60), near.clone().collect::<Vec<_>>());
+            let some = tokens(20);
+            assert!(some.len() == 20 && some.iter().all(|token| near.contains(token)), "{some:?}");
         }
     }
 

@@ -14,6 +14,8 @@ use crate::tokens::selection::token_ray::TokenRay;
 
 /// Fewest cells per task.
 const CELLS_PER_TASK: usize = 16;
+/// Added to the distance of tokens that are not candidates: more than any angle and any distance of near views.
+const NOT_A_CANDIDATE: f32 = 8.0;
 /// Distances of a row whose minimum is compared with the limit at once.
 const GROUP: usize = 32;
 
@@ -101,6 +103,22 @@ impl Selector {
         width: usize,
         num_render_tokens: usize,
     ) -> Result<Vec<u32>, ModelError> {
+        self.select_among(&[], camera, [height, width], num_render_tokens)
+    }
+
+    /// Selects tokens as [`select`](Self::select) does, candidates before others. `is_candidate` has a value per token, or
+    /// none if all are candidates. Momentum holds for candidates too: those that were none for the previous frames are
+    /// selected a few frames later.
+    ///
+    /// # Errors
+    /// As [`select`](Self::select).
+    pub fn select_among(
+        &mut self,
+        is_candidate: &[bool],
+        camera: &Camera,
+        [height, width]: [usize; 2],
+        num_render_tokens: usize,
+    ) -> Result<Vec<u32>, ModelError> {
         if num_render_tokens == 0 {
             let fix = "write at least 1".into();
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: "0".into(), fix });
@@ -114,7 +132,8 @@ impl Selector {
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
-        let nearest = self.measure(&cells, self.rules.grid(height, width), camera.c2w.translation, per_cell);
+        let offsets = self.offsets(camera.c2w.translation, is_candidate);
+        let nearest = self.measure(&cells, self.rules.grid(height, width), &offsets, per_cell);
         let chosen = nearest.choose(num_render_tokens);
         self.previous = vec![false; num_storage_tokens];
         for &token in &chosen {
@@ -135,10 +154,9 @@ impl Selector {
     }
 
     /// Updates the smoothed distances of all tokens to all cells and returns the nearest tokens.
-    fn measure(&mut self, cells: &[DVec3], grid: [usize; 2], target: DVec3, per_cell: usize) -> Nearest {
+    fn measure(&mut self, cells: &[DVec3], grid: [usize; 2], offsets: &[f32], per_cell: usize) -> Nearest {
         let num_tokens = self.origins.len();
         let SelectionRules { momentum, .. } = self.rules;
-        let offsets = self.offsets(target);
         let keeps_field = momentum > 0.0;
         let momentum = if self.grid == grid { momentum } else { 0.0 };
         if self.grid != grid {
@@ -150,7 +168,7 @@ impl Selector {
         let weigh = |mut found: Nearest, (cell, kept): (&DVec3, &mut Vec<f32>)| {
             let mut scratch = std::mem::take(&mut found.row);
             let row = if keeps_field { kept } else { &mut scratch };
-            directions.add_distances(cell.as_vec3(), &offsets, momentum, row);
+            directions.add_distances(cell.as_vec3(), offsets, momentum, row);
             for (nearest, &distance) in found.distance.iter_mut().zip(row.iter()) {
                 *nearest = if distance < *nearest { distance } else { *nearest };
             }
@@ -164,11 +182,12 @@ impl Selector {
     }
 
     /// Returns the part of every token's distance that is equal for all cells.
-    fn offsets(&self, target: DVec3) -> Vec<f32> {
+    fn offsets(&self, target: DVec3, is_candidate: &[bool]) -> Vec<f32> {
         let SelectionRules { distance_weight, previous_bonus, .. } = self.rules;
         let offset = |(token, origin): (usize, &DVec3)| {
             let bonus = if self.previous.get(token) == Some(&true) { previous_bonus } else { 0.0 };
-            distance_weight * origin.distance(target) as f32 - bonus
+            let penalty = if is_candidate.get(token) == Some(&false) { NOT_A_CANDIDATE } else { 0.0 };
+            distance_weight * origin.distance(target) as f32 - bonus + penalty
         };
         self.origins.iter().enumerate().map(offset).collect()
     }

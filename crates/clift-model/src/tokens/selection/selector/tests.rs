@@ -103,6 +103,27 @@ fn angle_equals_acos() {
 }
 
 #[test]
+fn candidates_come_before_other_tokens() {
+    let rays = random_rays(400, 3);
+    let front: Vec<bool> = (0..400).map(|token| token % 4 < 2).collect();
+    for &preset in SelectionPreset::ALL {
+        let mut selector = Selector::new(preset.rules(), &rays).unwrap();
+        let view = camera([0.1, 0.0, 0.0], 0.05);
+        let count = |ids: &[u32]| ids.iter().filter(|&&id| front[id as usize]).count();
+        let some = selector.select_among(&front, &view, [64, 64], 120).unwrap();
+        assert_eq!((some.len(), count(&some)), (120, 120), "{preset:?}");
+        let most = selector.select_among(&front, &view, [64, 64], 250).unwrap();
+        assert_eq!((most.len(), count(&most)), (250, 200), "{preset:?}: others fill the rest");
+        // The candidates alone are selected as if there were no other tokens.
+        let kept: Vec<u32> = (0..400).filter(|&token| front[token as usize]).collect();
+        let rays: Vec<TokenRay> = kept.iter().map(|&token| rays[token as usize]).collect();
+        let mut alone = Selector::new(preset.rules(), &rays).unwrap();
+        let expected = alone.select(&view, 64, 64, 120).unwrap();
+        assert_eq!(some, expected.iter().map(|&token| kept[token as usize]).collect::<Vec<_>>(), "{preset:?}");
+    }
+}
+
+#[test]
 fn frames_equal_brute_force_for_0_to_7_tokens_per_cell() {
     // A grid of (2 + 8) x (1 + 8) = 90 cells: n is 0, 0, 1, 3, 5, 6 and 7.
     let (height, width) = (32, 16);
