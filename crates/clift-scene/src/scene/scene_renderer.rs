@@ -309,7 +309,9 @@ impl TokenGroup {
 /// Returns whether each of `count` tokens is among `tokens`.
 fn mask(tokens: &[u32], count: usize) -> Vec<bool> {
     let mut mask = vec![false; count];
-    tokens.iter().for_each(|&token| mask[token as usize] = true);
+    for &token in tokens {
+        mask[token as usize] = true;
+    }
     mask
 }
 
