@@ -66,7 +66,9 @@ pub use error::ModelError;
 pub use names::{parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
-pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes, used_adapter};
+pub use device::adapter::{
+    ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes, product_instructions, used_adapter,
+};
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras

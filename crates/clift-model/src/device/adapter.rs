@@ -66,6 +66,26 @@ pub fn max_tensor_bytes(_device: &Device) -> Option<u64> {
     None
 }
 
+/// Says by which instructions an open GPU multiplies matrices in f32 and f16; `None` for a CPU.
+#[cfg(feature = "wgpu")]
+pub fn product_instructions(device: &Device) -> Option<String> {
+    use clift_cube::{AdapterClass, MatrixShape};
+    let device = device.clone().without_autodiff();
+    let burn::backend::DispatchDevice::Cube(device) = device.as_dispatch() else { return None };
+    Some(match AdapterClass::of(&device.client()) {
+        AdapterClass::Matrices(MatrixShape { sizes: [m, n, k], plane }) => format!(
+            "f32 by multiply-adds; f16 by cooperative matrices of {m} x {n} x {k} in subgroups of {plane}, with f32 sums"
+        ),
+        AdapterClass::Registers => "no cooperative matrices: f32, also with precision = \"f16\"".into(),
+    })
+}
+
+/// Returns nothing: this build does not contain the device `wgpu`.
+#[cfg(not(feature = "wgpu"))]
+pub fn product_instructions(_device: &Device) -> Option<String> {
+    None
+}
+
 impl fmt::Display for Adapter {
     /// Writes name, kind, API and driver.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

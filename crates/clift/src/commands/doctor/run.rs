@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clift_bench::{DeviceCheck, Gradient, probe};
 use clift_eval::{machine_rows, table};
-use clift_model::{DeviceName, InstructionSet, Precision};
+use clift_model::{DeviceName, InstructionSet, Precision, product_instructions};
 
 use crate::commands::args::parse::parse_output;
 use crate::commands::doctor::{adapters, stability};
@@ -30,6 +30,10 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     print_result(&format!("{}\n", machine.join("\n")))?;
     if let Some(adapters) = adapters::adapter_text() {
         print_result(&format!("{adapters}\n"))?;
+        // The table says why a device cannot be opened.
+        if let Some(text) = DeviceName::Wgpu.open().ok().as_ref().and_then(product_instructions) {
+            print_result(&format!("products of wgpu: {text}\n"))?;
+        }
     }
     let default = DeviceName::default();
     let reference = probe(default, Precision::F32).and_then(|probe| check(probe, None, TOLERANCE));
