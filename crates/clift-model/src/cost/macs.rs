@@ -179,9 +179,10 @@ mod tests {
     #[test]
     fn macs_equal_those_counted_in_a_forward_pass() {
         let device = Device::flex();
-        for config in small_configs() {
+        let grouped = ModelConfig { group_size: 2, ..small_configs().remove(0) };
+        for config in small_configs().into_iter().chain([grouped]) {
             let model = Network::new(&config, 0, &device);
-            for (num_views, [height, width], stored) in [(2, [16, 24], 5), (3, [8, 16], 1), (2, [24, 8], 6)] {
+            for (num_views, [height, width], stored) in [(2, [16, 24], 5), (3, [8, 16], 1), (4, [24, 8], 6)] {
                 let cameras = |views: usize| Cameras {
                     height,
                     width,
