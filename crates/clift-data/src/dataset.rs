@@ -126,7 +126,8 @@ pub fn half_size_reader(config: &DataConfig, reader: &ClipReader) -> Result<Clip
 /// Returns a reader of the same training clips as `reader`, of the data set of `config`, with images of another size, and the
 /// config with this size.
 ///
-/// Synthetic scenes that need no crop are drawn at that size, with the same field of view along the longer side.
+/// Synthetic scenes that need no crop are drawn at that size. Those of `look = "real"` keep the field of view of the longer
+/// side, rooms that of the width.
 ///
 /// # Errors
 /// [`DataError::BadConfig`] for a size that synthetic scenes cannot have.

@@ -81,6 +81,6 @@ pub use interchange::record::{ImportOptions, ImportRecord};
 // Memory and sizes of a run
 pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
 pub use footprint::memory::memory_warning;
-pub use footprint::plan::{Pace, PartPlan, Plan, check_plan, pace, plan};
+pub use footprint::plan::{PartPlan, Plan, RunEstimate, check_plan, estimate_run, plan};
 // Seeded inputs for tests and benchmarks
 pub use step::seeded_inputs::{ClipShape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};

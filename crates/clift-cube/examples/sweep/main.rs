@@ -83,8 +83,7 @@ fn run(sweep: &mut Sweep, class: AdapterClass, sizes: Sizes) {
     let attentions = [[sizes.tokens; 2], [sizes.queries, sizes.tokens], [sizes.queries; 2]];
     let attentions = attentions.map(|counts| Attention::new(sizes, counts));
 
-    let [_, input, weight] = layers[0].products();
-    let [forward, ..] = layers[0].products();
+    let [forward, input, weight] = layers[0].products();
     forward.run(sweep, &matrices, Values::F32);
     forward.run(sweep, &matrices, Values::F16);
     for direction in Direction::ALL {

@@ -108,7 +108,7 @@ impl<'a> Sweep<'a> {
         ))
     }
 
-    /// Waits for the device; the error of a refused launch is that of its result.
+    /// Waits for the device and returns its error: a refused launch fails only here.
     fn wait(&self, results: &[Buffer]) -> Result<(), String> {
         let handles = results.iter().map(|buffer| &buffer.handle);
         cubecl::future::block_on(self.client.sync_buffers(handles)).map_err(|error| error.to_string())

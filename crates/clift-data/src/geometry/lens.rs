@@ -323,13 +323,14 @@ mod tests {
     proptest! {
         #[test]
         fn undistort_inverts_distort(
-            x in -0.8..0.8, y in -0.8..0.8, k1 in -0.2..0.2, k2 in -0.05..0.05, p in -0.01..0.01, fisheye: bool,
+            x in -0.7..0.7, y in -0.7..0.7, k1 in -0.2..0.2, k2 in -0.05..0.05, p in -0.01..0.01, fisheye: bool,
         ) {
             let projection = if fisheye { Projection::Fisheye } else { Projection::Perspective };
             let radial = [k1, k2, 0.0, 0.0, 0.0, 0.0];
             let lens = Lens { projection, radial, tangential: [p, -p / 2.0], ..Lens::default() };
             let ray = lens.undistort(lens.distort([x, y]));
-            // Within this radius and these coefficients no lens folds over.
+            // No lens folds over: at r^2 <= 0.98 the radial slope is at least 1 - 0.6 r^2 - 0.25 r^4 = 0.17, the tangential one
+            // at most 0.09 (six times 0.01 r and half of it).
             let [u, v] = ray.expect("a ray");
             prop_assert!((u - x).abs() < 1e-9 && (v - y).abs() < 1e-9, "{u} {v}");
         }

@@ -177,6 +177,7 @@ mod tests {
             let [a, b] = [false, true].map(|turned| image(rays, turned));
             a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };
+        // In f32, poses of the turned frame are rounded to 1e-7.
         assert!(difference(RayFrame::Camera) < 1e-5, "{}", difference(RayFrame::Camera));
         assert!(difference(RayFrame::World) > 1e-3, "{}", difference(RayFrame::World));
     }
@@ -195,7 +196,7 @@ mod tests {
         let alone = [group(0), group(2)];
         let values = Tensor::cat(alone.iter().map(|tokens| tokens.values.clone()).collect(), 1);
         assert_close(&tokens.values, &values, 1e-6);
-        // The tokens keep their cameras: a rendering of the second group alone is that of its tokens in the scene.
+        // Tokens keep their cameras: rendering the second group alone gives the image of its tokens selected from the scene.
         let second: Vec<u32> = (8..16).collect();
         let images = [model.render(alone[1].clone(), &targets), model.render(tokens.select(&second), &targets)];
         assert_close(&images[0], &images[1], 1e-6);

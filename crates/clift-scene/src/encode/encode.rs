@@ -61,7 +61,7 @@ pub fn encode(
     let mut contexts = Contexts::choose(reader, scene, options)?;
     let num_tokens = model.config.num_tokens(contexts.num_members(), data.height, data.width)?;
     if options.stored_tokens.is_some_and(|count| count.of(num_tokens).is_err()) {
-        // The groups are few because the tokens are, and small groups do not have so many.
+        // Few requested tokens make few groups; groups of small images hold fewer tokens than requested.
         contexts = Contexts::choose(reader, scene, &EncodeOptions { stored_tokens: None, ..options.clone() })?;
     }
     let Contexts { frames, groups, normalization } = contexts;

@@ -39,7 +39,8 @@ pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usi
 /// Divides views into groups of neighbours, as few as possible of at most `num_views` views each, of about equal sizes, in
 /// ascending order each.
 ///
-/// The next group is that of the view farthest from its nearest others among the views left, so that none is left alone.
+/// Of all groups of a view and its nearest neighbours among the views left, the widest comes next: isolated views are grouped
+/// while they still have neighbours.
 pub(crate) fn neighbour_partition(views: &[Pose], num_views: usize) -> Vec<Vec<usize>> {
     let distance = ViewDistance::new(views);
     let mut left: Vec<usize> = (0..views.len()).collect();

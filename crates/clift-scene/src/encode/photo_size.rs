@@ -3,7 +3,7 @@
 /// Largest ratio of the sides of an image; longer photos are cropped.
 const MAX_ASPECT: f64 = 2.0;
 
-/// What a pixel less than in training counts, beside the logarithm of the ratio of the proportions.
+/// Cost of the share of the trained pixels that a size lacks, relative to the difference in log aspect ratio.
 const AREA_WEIGHT: f64 = 0.5;
 
 /// Returns width and height of images that show nearly all of a photo of `photo` pixels: multiples of the patch in about the

@@ -39,8 +39,8 @@ mod tests {
         let share = |distances: &[f64], group: usize| {
             group_shares(distances).iter().find(|(other, _)| *other == group).map_or(0.0, |(_, share)| *share)
         };
-        // Two groups swap places, a third comes and goes. A step changes a difference of distances by 0.002, of 0.05 to 0.15 over which
-        // a share falls from 1 to 0: by at most 0.04.
+        // Two groups swap places, a third comes and goes. A share falls from 1 to 0 over a difference in distance of 0.05 to
+        // 0.15, which a step changes by 0.002: the share changes by at most 0.04.
         for step in 0..1000 {
             let at = |step: i32| [f64::from(step) * 1e-3, 1.0 - f64::from(step) * 1e-3, 0.4, 0.45];
             let sum: f64 = (0..4).map(|group| share(&at(step), group)).sum();

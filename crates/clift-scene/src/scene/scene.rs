@@ -128,8 +128,8 @@ impl Scene {
         tokens
     }
 
-    /// Returns the most tokens that a view is rendered from at once: those of the largest group, or, of a network that joins
-    /// groups, those of the eight views with the most.
+    /// Returns the largest number of tokens that one view is rendered from: the tokens of the largest group. A network that joins
+    /// groups renders from eight views: their tokens, for the eight views with the most.
     pub fn max_render_tokens(&self) -> usize {
         if !self.model.joins_groups() {
             return self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default();

@@ -71,7 +71,7 @@ impl Config {
     }
 
     fn validate_further_sizes(&self) -> Result<(), BadConfig> {
-        let (patch_size, most) = (self.model.patch_size, self.data.width * self.data.height);
+        let (patch_size, most) = (self.model.patch_size, self.data.width.saturating_mul(self.data.height));
         for size in &self.stage1.further_sizes {
             let [is_small, has_patches] = [
                 size[0].saturating_mul(size[1]) <= most,
@@ -82,6 +82,13 @@ impl Config {
             })?;
             check_config(is_small, "stage1.further_sizes", format!("{size:?}"), || {
                 format!("write a size of at most {most} pixels, as data.width x data.height")
+            })?;
+            let is_large = size.iter().all(|&side| side >= PERCEPTUAL_MIN_SIZE_PX);
+            let has_enough = is_large || self.loss.perceptual_weight == 0.0;
+            check_config(has_enough, "stage1.further_sizes", format!("{size:?}"), || {
+                format!(
+                    "VGG-19 needs {PERCEPTUAL_MIN_SIZE_PX} pixels: write longer sides, or loss.perceptual_weight = 0"
+                )
             })?;
         }
         Ok(())

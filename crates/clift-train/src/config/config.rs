@@ -368,7 +368,11 @@ mod tests {
 
     #[test]
     fn invalid_values_are_named_with_the_fix() {
-        let cases: [(Change, &str); 8] = [
+        let cases: [(Change, &str); 9] = [
+            (
+                |c| (c.loss.perceptual_weight, c.stage1.further_sizes) = (0.5, vec![[8, 64]]),
+                "`stage1.further_sizes` = [8, 64]: VGG-19 needs 16 pixels: write longer sides, or loss.perceptual_weight = 0",
+            ),
             (|c| c.loss.perceptual_weight = -0.5, "`loss.perceptual_weight` = -0.5: write 0 or a positive number"),
             (
                 |c| (c.loss.perceptual_weight, c.data.width) = (0.5, 8),

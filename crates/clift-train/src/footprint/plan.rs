@@ -79,17 +79,23 @@ pub fn plan(config: &Config, num_ranks: usize) -> Result<Plan, TrainError> {
     })
 }
 
-/// What the time of a step says about a run.
+/// Speed of a run and its remaining time, estimated from a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Pace {
+pub struct RunEstimate {
     /// Floating-point operations per second of the rank with the most work.
     pub flops_per_s: f64,
-    /// Seconds of the later work at this pace. Parts whose number of scenes depends on the data do not count.
+    /// Seconds of the later work at this speed. Parts whose number of scenes depends on the data do not count.
     pub remaining_s: f64,
 }
 
-/// Derives the pace of a run from the wall time `step_s` of a step of a stage, by the multiply-accumulates of the plan.
-pub fn pace(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: f64) -> Result<Pace, TrainError> {
+/// Estimates speed and remaining time of a run from the wall time `step_s` of a step of a stage, by the multiply-accumulates of the plan.
+pub fn estimate_run(
+    config: &Config,
+    num_ranks: usize,
+    stage: Stage,
+    step: u64,
+    step_s: f64,
+) -> Result<RunEstimate, TrainError> {
     let plan = plan(config, num_ranks)?;
     let settings = config.stage(stage);
     let (batch_size, _) = scenes_of_rank(config, stage, num_ranks);
@@ -105,7 +111,7 @@ pub fn pace(config: &Config, num_ranks: usize, stage: Stage, step: u64, step_s: 
     let parts = plan.parts.iter().skip_while(|part| part.part != stage.name()).skip(1);
     later += parts.map(|part| part.count.unwrap_or_default() as f64 * part.gmacs).sum::<f64>();
     let of_step = if settings.is_half_resolution(step) { half } else { whole };
-    Ok(Pace { flops_per_s: 2e9 * of_step / step_s, remaining_s: step_s * later / of_step })
+    Ok(RunEstimate { flops_per_s: 2e9 * of_step / step_s, remaining_s: step_s * later / of_step })
 }
 
 /// Does [`Config::validate`] and [`Config::validate_half_resolution`] without requiring `data.root`.
@@ -280,10 +286,10 @@ mod tests {
         let gmacs = |i: usize| parts[i].count.expect("known") as f64 * parts[i].gmacs;
         let step = parts[0].gmacs;
         let assert_left = |config: &Config, stage, step, gmacs: f64| {
-            let left = pace(config, 1, stage, step, 2.0).expect("valid").remaining_s;
+            let left = estimate_run(config, 1, stage, step, 2.0).expect("valid").remaining_s;
             assert!((left / (2.0 * gmacs) - 1.0).abs() < 1e-9, "{left} {gmacs}");
         };
-        let rate = pace(&config, 1, Stage::Stage1, 0, 2.0).expect("valid").flops_per_s;
+        let rate = estimate_run(&config, 1, Stage::Stage1, 0, 2.0).expect("valid").flops_per_s;
         assert!((rate / (1e9 * step) - 1.0).abs() < 1e-9, "two operations per multiply-accumulate in two seconds");
         assert_left(&config, Stage::Stage1, 0, (gmacs(0) + gmacs(1) + gmacs(2) + gmacs(3)) / step);
         assert_left(&config, Stage::Stage2, config.stage2.steps, gmacs(3) / parts[2].gmacs);

@@ -13,8 +13,8 @@ use crate::config::config::{Algorithm, OptimizerConfig};
 use crate::step::adamw::AdamW;
 use crate::step::muon::Muon;
 
-/// The optimizer of a stage: AdamW, and, if the config names Muon, Muon for the weight
-/// matrices of the transformer blocks. Weight decay applies to every parameter.
+/// The optimizer of a stage: AdamW, and, if the config names Muon, Muon for the weight matrices of the transformer blocks.
+/// Weight decay applies to every parameter.
 ///
 /// Muon's updates are scaled to the size of AdamW's (`0.2 sqrt(max(rows, columns))`, arXiv 2502.16982), so that both
 /// optimizers share learning rate and weight decay.

@@ -5,7 +5,8 @@ use std::rc::Rc;
 
 use clift_eval::available_bytes;
 use clift_train::{
-    BatchParts, Config, Event, Pace, Ranks, Run, RunOptions, RunStep, Stage, StageSettings, memory_warning, pace,
+    BatchParts, Config, Event, Ranks, Run, RunEstimate, RunOptions, RunStep, Stage, StageSettings, estimate_run,
+    memory_warning,
 };
 
 use crate::commands::args::adapter::name_adapter;
@@ -42,7 +43,8 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     let mut sink = move |event: &Event| {
         sink.event(event);
         if let (Event::Pace { stage, step, step_s, .. }, None) = (event, args.only)
-            && let Ok(Pace { flops_per_s, remaining_s }) = pace(&planned, num_ranks, *stage, *step, *step_s)
+            && let Ok(RunEstimate { flops_per_s, remaining_s }) =
+                estimate_run(&planned, num_ranks, *stage, *step, *step_s)
         {
             let (rate, left) = (flops_per_s / 1e9, duration(remaining_s));
             let text = format!("{rate:.0} GFLOP/s; all stages and the evaluation: about {left} left");

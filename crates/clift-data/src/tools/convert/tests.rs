@@ -1,4 +1,4 @@
-//! Converted scenes equal those of the source.
+//! Tests that converted scenes equal their sources.
 
 use super::*;
 use crate::scene_source::Split;

@@ -1,0 +1,309 @@
+//! Renderings of scenes, groups and windows against independent references.
+
+use clift_model::{CameraEncoding, Network, RayFrame, SelectionPreset, psnr, save_weights};
+
+use super::*;
+use crate::scene::scene::tests::{camera, scene, scene_of_groups};
+use crate::testing::devices;
+
+fn config() -> ModelConfig {
+    encoded(CameraEncoding::Plucker)
+}
+
+fn encoded(camera_encoding: CameraEncoding) -> ModelConfig {
+    ModelConfig {
+        camera_encoding,
+        dim: 16,
+        num_heads: 2,
+        feed_forward_dim: 24,
+        num_encoder_blocks: 1,
+        num_renderer_blocks: 2,
+        ..ModelConfig::default()
+    }
+}
+
+/// A scene with all 12 tokens of two views of 24 x 16 pixels.
+fn whole_scene(renderer: &Renderer, config: &ModelConfig) -> Scene {
+    let tokens = (0..12 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
+    let renderer_hash = renderer_hash(renderer, config);
+    Scene { model: config.clone(), renderer_hash, tokens, token_ids: (0..12).collect(), ..scene() }
+}
+
+fn path(num_frames: usize) -> Vec<Camera> {
+    (0..num_frames).map(|i| camera(-0.5 + 0.1 * i as f64, 0.1 - 0.02 * i as f64)).collect()
+}
+
+fn assert_equals_single_frames(
+    device: &Device,
+    config: &ModelConfig,
+    preset: SelectionPreset,
+    count: usize,
+    tolerance: f32,
+) {
+    let renderer = Network::new(config, 3, device).renderer;
+    let scene = whole_scene(&renderer, config);
+    let context = Cameras::of_views(&scene.context, scene.height, scene.width, device).unwrap();
+    let mut scene_renderer = SceneRenderer::new(&scene, renderer.clone(), preset.rules(), device).unwrap();
+    let mut selector = Selector::new(preset.rules(), &scene.token_rays()).unwrap();
+    let rendered = scene_renderer.render(&path(11), 16, 24, count).unwrap();
+    assert_eq!(rendered.len(), 11);
+    for (view, rendered) in path(11).iter().zip(&rendered) {
+        let selected = (count < 12).then(|| selector.select(view, 16, 24, count).unwrap());
+        assert_eq!(rendered.tokens, selected);
+        let ids = selected.unwrap_or_else(|| (0..12).collect());
+        let values = ids.iter().flat_map(|&id| &scene.tokens[id as usize * 16..][..16]).copied();
+        let values = TensorData::new(values.collect::<Vec<f32>>(), [1, count, 16]);
+        let tokens = Tokens::of_patches(config, Tensor::from_data(values, device), &context, &ids);
+        let cameras = Cameras::of_views(&[*view], 16, 24, device).unwrap();
+        let alone = renderer.forward(tokens, &cameras).into_data().convert::<f32>();
+        let alone = alone.as_slice::<f32>().unwrap();
+        assert_eq!(alone.len(), rendered.pixels.len());
+        let error = rendered.pixels.iter().zip(alone).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(error <= tolerance, "{error} with {count} tokens");
+    }
+}
+
+#[test]
+fn frames_equal_images_of_their_tokens_alone() {
+    for config in CameraEncoding::ALL.map(encoded) {
+        for device in devices() {
+            // Matrix products of eight views have other block sizes than those of one view.
+            assert_equals_single_frames(&device, &config, SelectionPreset::Paper, 12, 1e-5);
+        }
+        for &preset in SelectionPreset::ALL {
+            assert_equals_single_frames(&Device::flex(), &config, preset, 5, 0.0);
+        }
+    }
+}
+
+/// The scene of two groups with all its 24 patches, on views of 24 x 16 pixels.
+fn grouped_scene(renderer: &Renderer, config: &ModelConfig) -> Scene {
+    let tokens = (0..24 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
+    let renderer_hash = renderer_hash(renderer, config);
+    let token_ids = (0..24).collect();
+    Scene { model: config.clone(), renderer_hash, tokens, token_ids, ..scene_of_groups() }
+}
+
+#[test]
+fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
+    let device = Device::flex();
+    for config in CameraEncoding::ALL.map(encoded) {
+        let renderer = Network::new(&config, 3, &device).renderer;
+        let scene = grouped_scene(&renderer, &config);
+        let rules = SelectionPreset::Paper.rules();
+        let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
+        for (group, view) in [(0, scene.context[0]), (1, scene.context[2])] {
+            // The group alone, in its frame.
+            let ContextGroup { views, frame } = &scene.groups[group];
+            let alone = Scene {
+                context: scene.group_cameras(&scene.groups[group]),
+                context_frames: vec![0; views.len()],
+                groups: vec![ContextGroup::of_all(views.len())],
+                token_ids: (0..12).collect(),
+                tokens: scene.tokens[group * 12 * 16..][..12 * 16].to_vec(),
+                ..scene.clone()
+            };
+            let mut alone = SceneRenderer::new(&alone, renderer.clone(), rules, &device).unwrap();
+            for count in [5, 12] {
+                let expected = Camera { c2w: frame.normalize(view.c2w), ..view };
+                let expected = alone.render(&[expected], 16, 24, count).unwrap().remove(0);
+                let got = whole.render(&[view], 16, 24, count).unwrap().remove(0);
+                assert_eq!(got.pixels, expected.pixels, "group {group}, {count} tokens");
+                assert_eq!(got.tokens.unwrap().len(), count);
+                alone.reset();
+                whole.reset();
+            }
+        }
+    }
+}
+
+#[test]
+fn a_network_with_rays_of_cameras_renders_from_the_tokens_of_all_groups() {
+    let device = Device::flex();
+    let config = ModelConfig { rays: RayFrame::Camera, ..encoded(CameraEncoding::Gta) };
+    let renderer = Network::new(&config, 3, &device).renderer;
+    let mut scene = grouped_scene(&renderer, &config);
+    scene.groups.iter_mut().for_each(|group| group.frame = ContextGroup::of_all(0).frame);
+    let members: Vec<Camera> =
+        scene.groups.iter().flat_map(|group| &group.views).map(|&view| scene.context[view as usize]).collect();
+    let members = Cameras::of_views(&members, 16, 24, &device).unwrap();
+    let rules = SelectionPreset::Paper.rules();
+    let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
+    assert_eq!(whole.max_render_tokens(), 24);
+    for (count, view) in [(9, scene.context[1]), (24, scene.context[1]), (30, scene.context[0])] {
+        let got = whole.render(&[view], 16, 24, count).unwrap().remove(0);
+        let ids = got.tokens.unwrap_or_else(|| (0..24).collect());
+        assert_eq!(ids.len(), count.min(24));
+        assert!(ids.iter().any(|&id| id < 12) && ids.iter().any(|&id| id >= 12), "of both groups: {ids:?}");
+        let values = ids.iter().flat_map(|&id| &scene.tokens[id as usize * 16..][..16]).copied();
+        let values = TensorData::new(values.collect::<Vec<f32>>(), [1, ids.len(), 16]);
+        let tokens = Tokens::of_patches(&config, Tensor::from_data(values, &device), &members, &ids);
+        let cameras = Cameras::of_views(&[view], 16, 24, &device).unwrap();
+        let expected = renderer.forward(tokens, &cameras).into_data().convert::<f32>();
+        let pairs = got.pixels.iter().zip(expected.as_slice::<f32>().unwrap());
+        let error = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        // f32: keys and values are projected before the selection, not after it.
+        assert!(error <= 1e-6, "{error} with {count} tokens");
+        whole.reset();
+    }
+}
+
+#[test]
+fn a_view_is_rendered_from_the_tokens_of_the_eight_nearest_views() {
+    let device = Device::flex();
+    let config = ModelConfig { rays: RayFrame::Camera, ..encoded(CameraEncoding::Gta) };
+    let renderer = Network::new(&config, 3, &device).renderer;
+    // Ten views in a row of 6 patches each, in five groups.
+    let context: Vec<Camera> = (0..10).map(|view| camera(0.2 * f64::from(view), 0.0)).collect();
+    let groups = (0..5).map(|group| ContextGroup { views: vec![2 * group, 2 * group + 1], ..ContextGroup::of_all(0) });
+    let scene = Scene {
+        context_frames: (0..10).collect(),
+        groups: groups.collect(),
+        token_ids: (0..60).collect(),
+        tokens: (0..60 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect(),
+        model: config.clone(),
+        renderer_hash: renderer_hash(&renderer, &config),
+        context: context.clone(),
+        ..scene()
+    };
+    let rules = SelectionPreset::Paper.rules();
+    let mut renderer = SceneRenderer::new(&scene, renderer, rules, &device).unwrap();
+    assert_eq!((scene.max_render_tokens(), renderer.max_render_tokens()), (48, 48));
+    for (view, near) in [(context[0], 0..48_u32), (context[9], 12..60)] {
+        let mut tokens = |count: usize| {
+            renderer.reset();
+            renderer.render(&[view, view], 16, 24, count).unwrap().remove(0).tokens.unwrap()
+        };
+        assert_eq!(tokens(60), near.clone().collect::<Vec<_>>());
+        let some = tokens(20);
+        assert!(some.len() == 20 && some.iter().all(|token| near.contains(token)), "{some:?}");
+    }
+}
+
+/// Returns the middle of a frame by bicubic convolution of an image, `scale` pixels of the image per pixel: an independent
+/// reference in f64, with the filter of Pillow's BICUBIC.
+fn resampled(image: &[f32], [rows, columns]: [usize; 2], scale: f64, [height, width]: [usize; 2]) -> Vec<f32> {
+    let cubic = |x: f64| match x.abs() {
+        x if x < 1.0 => (1.5 * x - 2.5) * x * x + 1.0,
+        x if x < 2.0 => ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0,
+        _ => 0.0,
+    };
+    let taps = |from: usize, to: usize, pixel: usize| {
+        let centre = (pixel as f64 + 0.5 - to as f64 / 2.0) * scale + from as f64 / 2.0 - 0.5;
+        let weights: Vec<f64> = (0..from).map(|i| cubic((i as f64 - centre) / scale.max(1.0))).collect();
+        let sum: f64 = weights.iter().sum();
+        weights.into_iter().map(|weight| weight / sum).collect::<Vec<f64>>()
+    };
+    let across: Vec<Vec<f64>> = (0..width).map(|pixel| taps(columns, width, pixel)).collect();
+    let down: Vec<Vec<f64>> = (0..height).map(|pixel| taps(rows, height, pixel)).collect();
+    let pixel = |row: usize, column: usize, channel: usize| {
+        let value = |y: usize, x: usize| f64::from(image[(y * columns + x) * 3 + channel]);
+        let line = |y: usize| across[column].iter().enumerate().map(|(x, weight)| weight * value(y, x)).sum::<f64>();
+        down[row].iter().enumerate().map(|(y, weight)| weight * line(y)).sum::<f64>() as f32
+    };
+    (0..height * width * 3).map(|i| pixel(i / 3 / width, i / 3 % width, i % 3)).collect()
+}
+
+/// Returns the middle columns of a frame.
+fn middle(frame: &[f32], width: usize, columns: usize) -> Vec<f32> {
+    let left = (width - columns) / 2;
+    frame.chunks(width * 3).flat_map(|row| &row[left * 3..][..columns * 3]).copied().collect()
+}
+
+#[test]
+fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
+    let device = Device::flex();
+    // The trained image has 24 x 16 pixels; sizes are height and width.
+    let sizes: [[usize; 2]; 20] = [
+        [8, 12],
+        [12, 18],
+        [14, 21],
+        [16, 24],
+        [17, 25],
+        [20, 30],
+        [24, 36],
+        [31, 47],
+        [32, 48],
+        [40, 60],
+        [48, 72],
+        [64, 96],
+        [128, 192],
+        [16, 12],
+        [40, 40],
+        [64, 24],
+        [16, 36],
+        [24, 60],
+        [32, 128],
+        [48, 192],
+    ];
+    for (encoding, grids) in [
+        (CameraEncoding::Plucker, PatchGrids::One),
+        (CameraEncoding::Gta, PatchGrids::Two),
+        (CameraEncoding::Prope, PatchGrids::Four),
+    ] {
+        let config = ModelConfig { patch_grids: grids, ..encoded(encoding) };
+        let renderer = Network::new(&config, 3, &device).renderer;
+        let scene = whole_scene(&renderer, &config);
+        let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
+        let mut frame = |size: [usize; 2], count| {
+            renderer.reset();
+            let view = camera(0.1, 0.2).resized([16, 24], size);
+            renderer.render(&[view], size[0], size[1], count).unwrap().remove(0).pixels
+        };
+        for (size, count) in sizes.into_iter().flat_map(|size| [(size, 12), (size, 5)]) {
+            let [height, width] = size;
+            let trained = frame([16, 24], count);
+            // The columns of the frame inside of the trained field of view, in the middle. Those of a wide frame mix with
+            // others within the reach of the filter, two pixels.
+            let inside = height * 3 / 2;
+            let reach = 2 * height.div_ceil(8);
+            let columns = if width > inside { inside - (width - inside) % 2 - reach } else { width };
+            // Of a wide frame other tokens may be selected.
+            if width > inside + 1 && count < 12 {
+                continue;
+            }
+            let expected = resampled(&trained, [16, 24], 16.0 / height as f64, [height, columns]);
+            let got = middle(&frame(size, count), width, columns);
+            let db = psnr(&got, &expected).unwrap();
+            assert!(db >= 45.0, "{encoding:?}, {size:?}, {count} tokens: {db} dB");
+        }
+    }
+}
+
+#[test]
+fn frames_of_any_size_are_bounded_in_memory() {
+    let sizes = [(16, 24), (512, 512), (1024, 1024), (2048, 2048), (1 << 14, 1 << 14), (0, 8)];
+    assert_eq!(sizes.map(|(height, width)| frames_per_call(height, width)), [8, 8, 2, 1, 1, 8]);
+    assert_eq!([[8, 8], [64, 64], [128, 128], [512, 512]].map(images_per_call), [8, 8, 2, 1]);
+}
+
+#[test]
+fn a_scene_accepts_only_its_own_renderer() {
+    let device = Device::flex();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    let model = Network::new(&config(), 3, &device);
+    let scene = whole_scene(&model.renderer, &config());
+    save_weights(&model, &path).unwrap();
+    let renderer = load_renderer(&scene, &path, &device).unwrap();
+    assert_eq!(renderer_hash(&renderer, &config()), scene.renderer_hash);
+    let assert_refused = |change: fn(&mut ModelConfig), expected: &str| {
+        let mut scene = scene.clone();
+        change(&mut scene.model);
+        let message = load_renderer(&scene, &path, &device).unwrap_err().to_string();
+        assert!(message.contains(expected), "{message}");
+    };
+    // The weights have the same shapes with one head as with two.
+    let expected = format!("the scene was made for the renderer {}, this", &scene.renderer_hash[..12]);
+    assert_refused(|model| model.num_heads = 1, &expected);
+    // The same holds for camera-relative attention, which has no weights.
+    assert_refused(|model| model.camera_encoding = CameraEncoding::Gta, &expected);
+    save_weights(&Network::new(&config(), 4, &device), &path).unwrap();
+    assert_refused(|_| (), &expected);
+    save_weights(&model.encoder, &path).unwrap();
+    assert_refused(|model| model.num_renderer_blocks = 1, "parameters of the scene's renderer are missing");
+    assert_refused(
+        |model| (model.dim, model.feed_forward_dim, model.num_renderer_blocks) = (1 << 16, 1 << 18, 1 << 10),
+        "the scene's renderer needs at least 14074",
+    );
+}
