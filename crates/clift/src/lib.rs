@@ -40,6 +40,10 @@ pub fn main() -> ExitCode {
     let args = Args::parse();
     args.verbosity().choose();
     keep_freed_memory();
+    threads::flush_subnormals(|| run(args))
+}
+
+fn run(args: Args) -> ExitCode {
     if Launched::find().num_ranks == 1 {
         threads::start(None);
     }
