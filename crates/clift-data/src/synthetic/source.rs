@@ -93,7 +93,7 @@ impl SyntheticSource {
         if is_room {
             Scene::Room(Box::new(Room::sample(&mut rng, &self.config)))
         } else {
-            Scene::Real(Box::new(RealScene::sample(rng)))
+            Scene::Real(Box::new(RealScene::sample(rng, self.config.look == Look::Mixed)))
         }
     }
 
@@ -152,7 +152,7 @@ impl SceneSource for SyntheticSource {
             Scene::Room(room) => {
                 ray_tracer::render(room, &camera, width, height, samples_per_pixel.isqrt(), specular as f32)
             }
-            Scene::Real(scene) => scene.render(&camera, [width, height]),
+            Scene::Real(scene) => scene.render(&camera, frame, [width, height]),
         })
     }
 }
@@ -253,13 +253,23 @@ mod tests {
     }
 
     #[test]
-    fn mixed_scenes_are_those_of_both_looks() {
-        let of = |look| source(|c| (c.look, c.num_scenes) = (look, 20));
+    fn mixed_scenes_are_rooms_and_places_whose_frames_differ_in_roll_and_zoom() {
+        let of = |look| source(|c| (c.look, c.num_scenes) = (look, 40));
         let [mixed, real, rooms] = [Look::Mixed, Look::Real, Look::Rooms].map(of);
-        for scene in 0..20 {
-            let expected = if scene % 8 == 0 { &rooms } else { &real };
-            assert_eq!(mixed.sample(scene), expected.sample(scene), "{scene}");
+        let mut most: [f64; 2] = [0.0; 2];
+        for scene in 0..40 {
+            if scene % 8 == 0 {
+                assert_eq!(mixed.sample(scene), rooms.sample(scene), "{scene}");
+                continue;
+            }
+            let (mixed_cameras, real_cameras) = (mixed.cameras(scene).unwrap(), real.cameras(scene).unwrap());
+            for (camera, plain) in mixed_cameras.iter().zip(&real_cameras) {
+                most[0] = most[0].max((camera.c2w.rotation.x_axis.y - plain.c2w.rotation.x_axis.y).abs());
+                most[1] = most[1].max((camera.intrinsics.fx / plain.intrinsics.fx).ln().abs());
+            }
         }
+        let [roll, zoom] = most;
+        assert!((0.2..0.6).contains(&roll) && (0.1..0.26).contains(&zoom), "{most:?}");
     }
 
     #[test]

@@ -68,7 +68,7 @@ fn print_contexts(written: &WrittenScene, is_capture: bool) -> anyhow::Result<()
     if is_capture && !fog.is_empty() {
         let more = if fog.len() > MAX_LISTED { ", .." } else { "" };
         print_warning(format!(
-            "{} of {} context views are rendered below {MIN_CONTEXT_PSNR} dB or worse than the mean image, as fog: {}{more}; \
+            "fog, below {MIN_CONTEXT_PSNR} dB or worse than the mean image, in {} of {} renderings of context views: {}{more}; \
              their neighbours are too far away: take more photos in between, encode one part of the place with --near PHOTO, \
              or train on the capture (configs/capture.toml)",
             fog.len(),

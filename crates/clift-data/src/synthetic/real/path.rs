@@ -42,7 +42,19 @@ pub(crate) struct Path {
     shake: [[f32; 3]; 3],
     /// Amplitude of independent turns of every frame, in radians.
     jitter: f32,
+    spread: Spread,
     seed: u32,
+}
+
+/// Largest differences between the photos of one path, either way.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Spread {
+    /// Roll in radians.
+    roll: f32,
+    /// Natural logarithm of the focal length.
+    zoom: f32,
+    /// Exposure in stops.
+    stops: f32,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -93,7 +105,18 @@ impl Path {
         let mut wave = |size: f32| [dice.between(0.2, 1.0) * size, dice.between(0.5, 3.0), dice.between(0.0, TAU)];
         let swing = [(); 3].map(|()| wave(size));
         let shake = [0.08, 0.07, 0.09].map(|size| wave(size * by_hand));
-        Self { fov_deg, route, swing, shake, jitter: 0.02 * by_hand, seed: dice.bits() }
+        Self { fov_deg, route, swing, shake, jitter: 0.02 * by_hand, spread: Spread::default(), seed: dice.bits() }
+    }
+
+    /// Makes the frames photos of several people: cameras turned, zoomed and exposed differently, arcs up to half a circle.
+    pub fn spread_out(&mut self) {
+        let [some, more] = [0, 1].map(|row| hash(-1, row, self.seed));
+        // Most paths have little of each, few have all.
+        let share = |part| byte(some, part).powi(3);
+        self.spread = Spread { roll: 0.5 * share(0), zoom: 0.25 * share(1), stops: 0.8 * share(2) };
+        if let Route::Arc { angle, .. } = &mut self.route {
+            angle[1] *= 1.0 + 0.6 * byte(more, 0);
+        }
     }
 
     fn propose_move(dice: &mut Dice, world: &World, area: &Area, fov_deg: f32) -> Route {
@@ -199,18 +222,31 @@ impl Path {
                 pitch += way.y.atan2(way.x.hypot(way.z));
             }
         }
+        let Spread { roll: turned, zoom, .. } = self.spread;
+        let [turned, zoom] = [(turned, 0), (zoom, 1)].map(|(most, part)| most * self.difference(frame, part));
+        let roll = roll + turned;
         let noise = hash(frame as i32, 0, self.seed);
         let [yaw, pitch, roll] = [(yaw, 0), (pitch, 1), (roll, 2)]
             .map(|(angle, part)| f64::from(angle + self.jitter * (2.0 * byte(noise, part) - 1.0)));
         let rotation = DMat3::from_rotation_y(yaw) * DMat3::from_rotation_x(-pitch) * DMat3::from_rotation_z(roll);
         let longer = 0.5 / (0.5 * f64::from(self.fov_deg).to_radians()).tan();
-        let fx = longer / aspect.min(1.0);
+        let fx = longer / aspect.min(1.0) * f64::from(zoom.exp());
         let shift = hash(frame as i32, 1, self.seed);
         let [cx, cy] = [0, 1].map(|part| f64::from(0.5 + OFF_CENTER * (2.0 * byte(shift, part) - 1.0)));
         Camera {
             intrinsics: IntrinsicsNorm { fx, fy: fx * aspect, cx, cy },
             c2w: Pose { rotation, translation: position.as_dvec3() },
         }
+    }
+
+    /// Returns the factor of a frame's exposure.
+    pub fn exposure(&self, frame: usize) -> f32 {
+        (self.spread.stops * self.difference(frame, 2)).exp2()
+    }
+
+    /// Returns a value of a frame's own in `[-1, 1]`.
+    fn difference(&self, frame: usize, part: u32) -> f32 {
+        2.0 * byte(hash(frame as i32, 2, self.seed), part) - 1.0
     }
 }
 

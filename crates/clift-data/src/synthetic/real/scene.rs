@@ -29,7 +29,8 @@ pub(crate) struct RealScene {
 }
 
 impl RealScene {
-    pub fn sample(rng: ChaCha8Rng) -> Self {
+    /// Samples a scene; `is_spread` for frames that differ as photos of several people do.
+    pub fn sample(rng: ChaCha8Rng, is_spread: bool) -> Self {
         let mut builder = Builder::new(Dice(rng));
         let (light, area, ground) = match builder.dice.count(0, 19) {
             0..=10 => interior(&mut builder),
@@ -38,7 +39,10 @@ impl RealScene {
         };
         let Builder { mut dice, solids, surfaces, .. } = builder;
         let world = World::new(solids, surfaces, ground);
-        let path = Path::sample(&mut dice, &world, &area);
+        let mut path = Path::sample(&mut dice, &world, &area);
+        if is_spread {
+            path.spread_out();
+        }
         // Where no path was clear, or a thin thing stands between the places that were checked.
         let positions = path.positions();
         let is_clear = positions.iter().all(|&position| world.is_clear(position, CLEARANCE));
@@ -57,8 +61,10 @@ impl RealScene {
         self.path.camera(time as f32, aspect, frame)
     }
 
-    pub fn render(&self, camera: &Camera<IntrinsicsNorm>, size: [usize; 2]) -> RgbImage {
-        render(&self.world, &self.light, &self.exposure, camera, size)
+    /// Draws a frame through its `camera`.
+    pub fn render(&self, camera: &Camera<IntrinsicsNorm>, frame: usize, size: [usize; 2]) -> RgbImage {
+        let exposure = Exposure { gain: self.exposure.gain * self.path.exposure(frame), ..self.exposure };
+        render(&self.world, &self.light, &exposure, camera, size)
     }
 }
 
@@ -205,7 +211,7 @@ mod tests {
     use clift_core::step_rng;
 
     fn scene(number: u64) -> RealScene {
-        RealScene::sample(step_rng(4, number, "test"))
+        RealScene::sample(step_rng(4, number, "test"), number % 2 == 1)
     }
 
     #[test]
@@ -220,9 +226,32 @@ mod tests {
                 assert!(camera.c2w.orthonormality_defect() < 1e-6);
                 assert!(camera.c2w.rotation.y_axis.y > 0.3, "scene {number} is upside down");
                 let fov = 2.0 * (0.5 / camera.intrinsics.fx).atan().to_degrees();
-                assert!((39.9..100.1).contains(&fov), "{fov}");
+                assert!((31.0..114.0).contains(&fov), "{fov}");
             }
         }
+    }
+
+    #[test]
+    fn frames_of_spread_scenes_differ_in_exposure() {
+        let mean = |scene: &RealScene, frame| {
+            let rgb = scene.render(&scene.camera(0.5, 1.0, 8), frame, [32, 32]).rgb;
+            rgb.iter().map(|&value| f64::from(value)).sum::<f64>() / rgb.len() as f64
+        };
+        let mut num_different = 0;
+        for number in 0..40 {
+            let scene = scene(number);
+            let exposure = |frame: usize| scene.path.exposure(frame);
+            let mut frames: Vec<usize> = (0..16).collect();
+            frames.sort_by(|&a, &b| exposure(a).total_cmp(&exposure(b)));
+            let [low, high] = [frames[0], frames[15]];
+            let ratio = exposure(high) / exposure(low);
+            assert!((1.0..3.1).contains(&ratio) && (number % 2 == 1 || ratio == 1.0), "scene {number}: {ratio}");
+            if ratio > 1.3 {
+                num_different += 1;
+                assert!(mean(&scene, high) > mean(&scene, low) + 5.0, "scene {number}");
+            }
+        }
+        assert!(num_different > 3, "{num_different}");
     }
 
     #[test]
@@ -230,7 +259,7 @@ mod tests {
         let mut means = Vec::new();
         for number in 0..100 {
             let scene = scene(number);
-            let frame = scene.render(&scene.camera(0.5, 1.0, 8), [32, 32]);
+            let frame = scene.render(&scene.camera(0.5, 1.0, 8), 8, [32, 32]);
             let values = || frame.rgb.iter().map(|&value| f64::from(value) / 255.0);
             let mean = values().sum::<f64>() / 3072.0;
             let deviation = (values().map(|value| (value - mean).powi(2)).sum::<f64>() / 3072.0).sqrt();
