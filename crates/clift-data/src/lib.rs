@@ -63,7 +63,7 @@ pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
 pub use sampling::training_clips::TrainingClips;
-pub use sampling::view_sampler::{ViewSampler, sample_targets};
+pub use sampling::view_sampler::{ViewSampler, Window};
 
 // Lenses, files of poses, and measures on poses.
 pub use geometry::lens::{Lens, Projection};

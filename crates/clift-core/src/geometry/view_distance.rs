@@ -25,6 +25,17 @@ impl ViewDistance {
         a.translation.distance(b.translation) / self.extent + a.rotation.z_axis.angle_between(b.rotation.z_axis)
     }
 
+    /// Returns the position of a view of `views` and those of the `num_views - 1` nearest others, in ascending order.
+    pub fn nearest(&self, views: &[Pose], seed: usize, num_views: usize) -> Vec<usize> {
+        let mut others: Vec<usize> = (0..views.len()).filter(|&view| view != seed).collect();
+        let to_seed = |view: usize| self.between(&views[view], &views[seed]);
+        others.sort_by(|&a, &b| to_seed(a).total_cmp(&to_seed(b)));
+        others.truncate(num_views - 1);
+        others.push(seed);
+        others.sort_unstable();
+        others
+    }
+
     /// Returns the distance of a view from a group of views: their mean distance plus the smallest.
     pub fn to_group<'a>(&self, view: &Pose, group: impl IntoIterator<Item = &'a Pose>) -> f64 {
         let distances: Vec<f64> = group.into_iter().map(|other| self.between(view, other)).collect();
@@ -53,6 +64,7 @@ mod tests {
         }
         let expected = 0.5 / 1.5;
         assert!((distance.to_group(&views[0], &views[..2]) - expected).abs() < 1e-12, "mean plus smallest");
+        assert_eq!((distance.nearest(&views, 2, 2), distance.nearest(&views, 0, 3)), (vec![1, 2], vec![0, 1, 2]));
         let turning = [view(5.0, 0.0), view(5.0, 30.0)];
         let angle = ViewDistance::new(&turning).between(&turning[0], &turning[1]);
         assert!((angle.to_degrees() - 30.0).abs() < 1e-9, "{angle}");

@@ -1,6 +1,6 @@
 //! Samples the context and target frames of a training item.
 
-use clift_core::{BadConfig, check_config, sample_from, step_rng, uniform_below, uniform_between};
+use clift_core::{BadConfig, Pose, ViewDistance, check_config, sample_from, step_rng, uniform_below, uniform_between};
 use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -23,8 +23,18 @@ pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -
     init + (last.saturating_sub(init) as u128 * u128::from(step) / u128::from(warm_up_steps)) as usize
 }
 
-/// Samples a range of consecutive frames. The contexts are the two ends and some inner frames, the targets any frames
-/// of the range.
+/// Frames that the views of an item are sampled from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Window {
+    /// Consecutive frames, of a film or a clip.
+    #[default]
+    Consecutive,
+    /// A frame and those nearest to it, by place and viewing direction: photos in any order.
+    Nearest,
+}
+
+/// Samples a range of frames. The contexts are the two ends and some inner frames, the targets any frames of the range.
 ///
 /// The gap (last minus first frame) is uniform in `[min_gap, max_gap]`, and both bounds grow during training
 /// (linear warm-up). This is the `bounded_v2` sampler of DepthSplat, which the paper uses. The default is its
@@ -52,6 +62,8 @@ pub struct ViewSampler {
     pub with_replacement: bool,
     /// Selection of the contexts between the two ends: `random`, `farthest_point` or `even`.
     pub inner: InnerViews,
+    /// The range: `consecutive` frames, or a frame and those `nearest` to it, as in photos without an order.
+    pub window: Window,
 }
 
 impl Default for ViewSampler {
@@ -66,6 +78,7 @@ impl Default for ViewSampler {
             num_targets: 6,
             with_replacement: true,
             inner: InnerViews::Random,
+            window: Window::Consecutive,
         }
     }
 }
@@ -127,7 +140,7 @@ impl ViewSampler {
         gaps.max().unwrap_or(0) + 1
     }
 
-    /// Samples the views of one item from a scene of `source`. Cameras are read only if [`InnerViews::needs_centres`].
+    /// Samples the views of one item from a scene of `source`. Cameras are read only where they decide.
     ///
     /// # Errors
     /// [`DataError::NotEnoughFrames`] if the scene is not longer than the smallest gap at `step`,
@@ -141,11 +154,32 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
-        if !self.inner.needs_centres() {
+        if self.window == Window::Consecutive && !self.inner.needs_centres() {
             return self.sample_frames(source.num_frames(scene)?, &[], step, num_context, rng);
         }
-        let centres: Vec<DVec3> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation).collect();
+        let poses: Vec<Pose> = source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
+        if self.window == Window::Nearest {
+            return self.sample_nearest(&poses, step, num_context, rng);
+        }
+        let centres: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
         self.sample_frames(centres.len(), &centres, step, num_context, rng)
+    }
+
+    /// Samples the views of one item among a frame and those nearest to it: as many as a range has.
+    fn sample_nearest(
+        &self,
+        poses: &[Pose],
+        step: u64,
+        num_context: usize,
+        rng: &mut impl Rng,
+    ) -> Result<ViewIndices, DataError> {
+        let gap = self.sample_gap(poses.len(), step, num_context, rng)?;
+        let seed = uniform_below(rng, poses.len());
+        let frames = ViewDistance::new(poses).nearest(poses, seed, gap + 1);
+        let centres: Vec<DVec3> = frames.iter().map(|&frame| poses[frame].translation).collect();
+        let ViewIndices { context, target } = self.sample_between(0, gap, num_context, &centres, rng);
+        let of_scene = |positions: Vec<usize>| positions.into_iter().map(|position| frames[position]).collect();
+        Ok(ViewIndices { context: of_scene(context), target: of_scene(target) })
     }
 
     /// Samples the views of one item from a scene of `num_frames` frames. `centres` are the camera centres, empty
@@ -161,6 +195,19 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
+        let gap = self.sample_gap(num_frames, step, num_context, rng)?;
+        let left = uniform_below(rng, num_frames - gap);
+        Ok(self.sample_between(left, left + gap, num_context, centres, rng))
+    }
+
+    /// Samples the gap of an item from a scene of `num_frames` frames, and checks that it can have one.
+    fn sample_gap(
+        &self,
+        num_frames: usize,
+        step: u64,
+        num_context: usize,
+        rng: &mut impl Rng,
+    ) -> Result<usize, DataError> {
         let Self { min_context, max_context, .. } = *self;
         check_config((min_context..=max_context).contains(&num_context), "num_context", num_context, || {
             format!("use {min_context} to {max_context}")
@@ -169,9 +216,17 @@ impl ViewSampler {
         if num_frames <= min_gap {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });
         }
-        let gap = uniform_between(rng, min_gap, max_gap.min(num_frames - 1));
-        let left = uniform_below(rng, num_frames - gap);
-        let right = left + gap;
+        Ok(uniform_between(rng, min_gap, max_gap.min(num_frames - 1)))
+    }
+
+    fn sample_between(
+        &self,
+        left: usize,
+        right: usize,
+        num_context: usize,
+        centres: &[DVec3],
+        rng: &mut impl Rng,
+    ) -> ViewIndices {
         let target = if self.with_replacement {
             (0..self.num_targets).map(|_| uniform_between(rng, left, right)).collect()
         } else {
@@ -179,7 +234,29 @@ impl ViewSampler {
         };
         let inner = self.inner.choose(rng, left, right, num_context - 2, centres);
         let context = std::iter::once(left).chain(inner).chain([right]).collect();
-        Ok(ViewIndices { context, target })
+        ViewIndices { context, target }
+    }
+
+    /// Samples the targets of stage 2 for stored contexts: frames between the first and the last context or, with
+    /// [`Window::Nearest`], near a context, that are not context views. Targets repeat only if there are fewer such frames;
+    /// without any, they are contexts.
+    ///
+    /// # Errors
+    /// [`DataError::NotEnoughFrames`] if a context is not a frame of the scene, [`DataError::BadConfig`] for no contexts, and the
+    /// errors of reading the scene.
+    pub fn sample_targets(
+        &self,
+        source: &dyn SceneSource,
+        scene: usize,
+        context: &[usize],
+        rng: &mut impl Rng,
+    ) -> Result<Vec<usize>, DataError> {
+        let poses: Option<Vec<Pose>> = match self.window {
+            Window::Consecutive => None,
+            Window::Nearest => Some(source.cameras(scene)?.iter().map(|camera| camera.c2w).collect()),
+        };
+        let candidates = target_candidates(context, source.num_frames(scene)?, poses.as_deref())?;
+        Ok(sample_candidates(context, candidates, self.num_targets, rng))
     }
 
     fn gap_divisor(&self, num_context: usize) -> usize {
@@ -187,33 +264,35 @@ impl ViewSampler {
     }
 }
 
-/// Samples stage-2 targets of a stored context set: frames between the first and the last context that are not context views.
-///
-/// Targets repeat only if there are fewer candidates than targets. Without any candidate, contexts are sampled with
-/// replacement.
-///
-/// # Errors
-/// [`DataError::NotEnoughFrames`] if a context is not a frame of the scene, [`DataError::BadConfig`] for no contexts.
-pub fn sample_targets(
-    context: &[usize],
-    num_frames: usize,
-    num_targets: usize,
-    rng: &mut impl Rng,
-) -> Result<Vec<usize>, DataError> {
+/// Returns the frames that are not contexts and lie between the first and the last context; of photos in any order, which have
+/// `poses`, those as near to a context as the contexts are to each other.
+fn target_candidates(context: &[usize], num_frames: usize, poses: Option<&[Pose]>) -> Result<Vec<usize>, DataError> {
     let (Some(&first), Some(&last)) = (context.iter().min(), context.iter().max()) else {
         return Err(BadConfig::new("context", "[]", "use 1 or more frames").into());
     };
     if last >= num_frames {
         return Err(DataError::NotEnoughFrames { needed: last + 1, got: num_frames });
     }
-    let mut candidates: Vec<usize> = (first..=last).filter(|frame| !context.contains(frame)).collect();
-    if candidates.len() >= num_targets {
-        return Ok(sample_from(rng, candidates, num_targets));
+    let is_target = |frame: &usize| !context.contains(frame);
+    let Some(poses) = poses else { return Ok((first..=last).filter(is_target).collect()) };
+    let distance = ViewDistance::new(poses);
+    let to_nearest = |frame: usize| {
+        let others = context.iter().filter(|&&other| other != frame);
+        others.map(|&other| distance.between(&poses[frame], &poses[other])).fold(f64::INFINITY, f64::min)
+    };
+    let reach = context.iter().map(|&frame| to_nearest(frame)).fold(0.0, f64::max);
+    Ok((0..num_frames).filter(is_target).filter(|&frame| to_nearest(frame) <= reach).collect())
+}
+
+/// Samples `count` of `candidates`. They repeat only if there are fewer; without any, contexts are sampled with replacement.
+fn sample_candidates(context: &[usize], mut candidates: Vec<usize>, count: usize, rng: &mut impl Rng) -> Vec<usize> {
+    if candidates.len() >= count {
+        return sample_from(rng, candidates, count);
     }
     if candidates.is_empty() {
         candidates = context.to_vec();
     }
-    Ok((0..num_targets).map(|_| candidates[uniform_below(rng, candidates.len())]).collect())
+    (0..count).map(|_| candidates[uniform_below(rng, candidates.len())]).collect()
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use clift_core::{Pose, PoseNormalization, ViewDistance, median};
 use clift_data::{ClipReader, DataError, contexts_along_path};
 use clift_model::{ModelError, TokenCount};
 
-use crate::encode::groups::{nearest_views, neighbour_groups, neighbour_partition};
+use crate::encode::groups::{neighbour_groups, neighbour_partition};
 use crate::encode::options::{ContextChoice, EncodeOptions};
 use crate::error::SceneError;
 use crate::scene::scene::ContextGroup;
@@ -135,7 +135,7 @@ fn choose_frames(poses: &[Pose], choice: &ContextChoice, held_out: &[usize]) -> 
                 let fix = if frame < num_frames { "the frame is held out".into() } else { no_frame(frame) };
                 return Err(bad("--near", frame.to_string(), fix));
             };
-            nearest_views(&kept_poses, ViewDistance::new(&kept_poses), position, num_views)
+            ViewDistance::new(&kept_poses).nearest(&kept_poses, position, num_views)
         }
         ContextChoice::Spread(num_views) => spread(num_views)?,
         ContextChoice::Neighbours { num_views, num_groups: Some(count), joined: true } => {

@@ -22,7 +22,7 @@ pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usi
         // The first of equally far views.
         let candidates = (0..views.len()).rev().filter(|&view| is_left_out[view] || !any_left);
         let Some(seed) = candidates.max_by(|&a, &b| to_seeds[a].total_cmp(&to_seeds[b])) else { break };
-        let group = nearest_views(views, distance, seed, num_views);
+        let group = distance.nearest(views, seed, num_views);
         for &view in &group {
             is_left_out[view] = false;
         }
@@ -53,7 +53,7 @@ pub(crate) fn neighbour_partition(views: &[Pose], num_views: usize) -> Vec<Vec<u
             group.iter().map(|&view| distance.between(&poses[view], &poses[seed])).sum()
         };
         let of_seeds = (0..poses.len()).map(|seed| {
-            let group = nearest_views(&poses, distance, seed, size);
+            let group = distance.nearest(&poses, seed, size);
             (width(&group, seed), group)
         });
         let Some((_, group)) = of_seeds.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
@@ -63,17 +63,6 @@ pub(crate) fn neighbour_partition(views: &[Pose], num_views: usize) -> Vec<Vec<u
     }
     groups.sort();
     groups
-}
-
-/// Returns a view and the `num_views - 1` nearest others, in ascending order.
-pub(crate) fn nearest_views(views: &[Pose], distance: ViewDistance, seed: usize, num_views: usize) -> Vec<usize> {
-    let mut others: Vec<usize> = (0..views.len()).filter(|&view| view != seed).collect();
-    let to_seed = |view: usize| distance.between(&views[view], &views[seed]);
-    others.sort_by(|&a, &b| to_seed(a).total_cmp(&to_seed(b)));
-    others.truncate(num_views - 1);
-    others.push(seed);
-    others.sort_unstable();
-    others
 }
 
 #[cfg(test)]

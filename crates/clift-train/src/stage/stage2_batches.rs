@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use clift_core::{derive_seed, item_rng, step_rng, uniform_below};
-use clift_data::{Clip, ClipReader, NoUsableScene, SkippedScene, SlotFiller, ViewIndices, sample_targets};
+use clift_data::{Clip, ClipReader, NoUsableScene, SkippedScene, SlotFiller, ViewIndices, ViewSampler};
 use clift_model::SceneClusters;
 
 use crate::cluster_cache::cache::{CacheEntry, ClusterCache};
@@ -23,7 +23,7 @@ pub struct Stage2Batches {
     /// Entries with equal numbers of tokens and of clusters, which a batch needs.
     groups: Vec<Vec<usize>>,
     parts: BatchParts,
-    num_targets: usize,
+    views: ViewSampler,
     seed: u64,
 }
 
@@ -47,7 +47,7 @@ impl Stage2Batches {
             cache,
             groups: groups.into_values().collect(),
             parts,
-            num_targets: config.data.views.num_targets,
+            views: config.data.views.clone(),
             seed: derive_seed(config.seed, "stage2"),
         })
     }
@@ -107,8 +107,7 @@ impl Stage2Batches {
         let scene = source
             .find(&entry.key)
             .ok_or_else(|| TrainError::NoScenes { reason: "the scene is not in the data".into() })?;
-        let num_frames = source.num_frames(scene)?;
-        let target = sample_targets(&entry.context, num_frames, self.num_targets, rng)?;
+        let target = self.views.sample_targets(source.as_ref(), scene, &entry.context, rng)?;
         let clip = self.reader.read(scene, &ViewIndices { context: entry.context.clone(), target })?;
         Ok((clip, self.cache.read(entry)?))
     }

@@ -66,7 +66,8 @@ fn invalid_value_is_named_with_its_key() {
 fn stage_two_targets_are_no_contexts_while_others_exist() {
     let mut rng = item_rng(1, 0, 0, 0, "test");
     let mut sorted = |context: &[usize], count: usize| {
-        sample_targets(context, 20, count, &mut rng).map(|mut targets| {
+        target_candidates(context, 20, None).map(|candidates| {
+            let mut targets = sample_candidates(context, candidates, count, &mut rng);
             targets.sort_unstable();
             targets
         })
@@ -77,6 +78,27 @@ fn stage_two_targets_are_no_contexts_while_others_exist() {
     assert!(only_contexts.len() == 6 && only_contexts.iter().all(|target| (3..=5).contains(target)));
     assert_eq!(sorted(&[3, 20], 3).unwrap_err().to_string(), "not enough frames: 21 needed, 20 in the scene");
     assert!(sorted(&[], 3).is_err());
+}
+
+#[test]
+fn nearest_frames_are_neighbours_in_space_in_any_order() {
+    // Frame 7 * i is at place i of a line.
+    let place = |frame: usize| frame * 23 % 40;
+    let pose = |frame| Pose { translation: place(frame) as f64 * DVec3::X, ..Pose::IDENTITY };
+    let poses: Vec<Pose> = (0..40).map(pose).collect();
+    let gaps = ViewSampler { min_gap: [8, 8], max_gap: [8, 8], warm_up_steps: 0, ..sampler() };
+    for seed in 0..50 {
+        let mut rng = item_rng(seed, 0, 0, 0, "test");
+        let ViewIndices { context, target } = gaps.sample_nearest(&poses, 0, 6, &mut rng).unwrap();
+        assert!(context.len() == 6 && target.len() == 6 && context.is_sorted_by(|a, b| a < b), "{context:?}");
+        let places: BTreeSet<usize> = context.iter().chain(&target).map(|&frame| place(frame)).collect();
+        assert!(places.last().unwrap() - places.first().unwrap() <= 8, "{places:?}");
+        // Contexts are at most 4 places from the next.
+        let targets = target_candidates(&context, 40, Some(&poses)).unwrap();
+        assert!(targets.iter().all(|frame| !context.contains(frame)));
+        assert!(targets.iter().all(|&frame| places.iter().any(|near| near.abs_diff(place(frame)) <= 4)), "{targets:?}");
+    }
+    assert!(gaps.sample_nearest(&poses[..8], 0, 6, &mut item_rng(0, 0, 0, 0, "test")).is_err());
 }
 
 #[test]
