@@ -121,9 +121,12 @@ pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures}
 pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
 pub use metrics::vgg::{Pooling, VggShape, VggSizes};
 // Weight files and trained models
-pub use weights::file::{first_not_f32, load_part, save_part, save_part_f16, save_weights, sorted_header};
+pub use weights::file::{
+    first_not_f32, load_adapted, load_part, save_part, save_part_f16, save_weights, sorted_header,
+};
 pub use weights::hash::{renderer_hash, weights_hash};
 pub use weights::model_path::{ModelPath, check_condenser, check_sizes, refuse_checkpoint};
+pub use weights::patch_adapter::PatchAdapter;
 pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };

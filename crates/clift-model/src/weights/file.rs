@@ -16,6 +16,7 @@ use clift_core::{TEMPORARY, folder_of, publish_file};
 
 use crate::error::ModelError;
 use crate::weights::hash::visit;
+use crate::weights::patch_adapter::PatchAdapter;
 
 /// The parameters that were read from a file into a module, and those that were not.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -133,13 +134,24 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
 /// # Errors
 /// [`ModelError::Weights`] if the file cannot be read, a shape differs, or a value is not finite or wider than f32.
 pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<LoadReport, ModelError> {
-    read(module, SafetensorsStore::from_file(path).filter(part.clone()), part, path)
+    load_adapted(module, part, path, PatchAdapter::default())
+}
+
+/// Reads parameters as [`load_part`], those between pixels and tokens through an adapter.
+pub fn load_adapted<M: Module>(
+    module: &mut M,
+    part: &PathFilter,
+    path: &Path,
+    adapter: PatchAdapter,
+) -> Result<LoadReport, ModelError> {
+    let store = SafetensorsStore::from_file(path).filter(part.clone());
+    read(module, store.with_from_adapter(PyTorchToBurnAdapter.chain(Widen).chain(adapter)), part, path)
 }
 
 /// Reads one module of a larger one from its file, such as the `renderer` of a whole model.
 pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<LoadReport, ModelError> {
     let store = SafetensorsStore::from_file(path).with_key_remapping(format!("^{name}\\."), "");
-    read(module, store, &PathFilter::all(), path)
+    read(module, store.with_from_adapter(PyTorchToBurnAdapter.chain(Widen)), &PathFilter::all(), path)
 }
 
 fn read<M: Module>(
@@ -152,7 +164,7 @@ fn read<M: Module>(
     if !path.is_file() {
         return Err(error("no such file".into()));
     }
-    let mut store = store.with_from_adapter(PyTorchToBurnAdapter.chain(Widen)).validate(false).allow_partial(true);
+    let mut store = store.validate(false).allow_partial(true);
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
         return Err(error(describe(first)));

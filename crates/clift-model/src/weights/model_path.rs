@@ -103,7 +103,12 @@ pub fn refuse_checkpoint(path: &Path) -> Result<(), ModelError> {
 /// # Errors
 /// [`ModelError::BadConfig`] with the first other size, [`ModelError::BadConfigFile`] for a config that cannot be read.
 pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
-    check_equal(model, dir, |config| {
+    read_config(dir)?.map_or(Ok(()), |found| check_equal_sizes(model, &found, dir))
+}
+
+/// Checks that encoder and renderer of a network have the sizes `found` in the config of `dir`.
+pub(crate) fn check_equal_sizes(model: &ModelConfig, found: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
+    check_equal(model, found, dir, |config| {
         vec![
             ("model.num_heads", config.num_heads.to_string()),
             ("model.architecture", config.architecture.to_string()),
@@ -122,23 +127,26 @@ pub fn check_sizes(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
 
 /// Checks what tensor shapes do not determine in the condenser, for weights with a trained one.
 pub fn check_condenser(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
-    check_equal(model, dir, |config| vec![("model.condenser.member_share", config.condenser.member_share.to_string())])
+    let Some(found) = read_config(dir)? else { return Ok(()) };
+    check_equal(model, &found, dir, |config| {
+        vec![("model.condenser.member_share", config.condenser.member_share.to_string())]
+    })
 }
 
 fn check_equal(
     model: &ModelConfig,
+    found: &ModelConfig,
     dir: &Path,
     values: impl Fn(&ModelConfig) -> Vec<(&'static str, String)>,
 ) -> Result<(), ModelError> {
-    let Some(found) = read_config(dir)? else { return Ok(()) };
-    let mut pairs = values(model).into_iter().zip(values(&found));
+    let mut pairs = values(model).into_iter().zip(values(found));
     let Some(((key, value), (_, of_weights))) = pairs.find(|(own, other)| own != other) else { return Ok(()) };
     let path = dir.join("config.toml");
     let fix = format!("the weights are of a network with {of_weights}; write the same: {}", path.display());
     Err(ModelError::BadConfig { key, value, fix })
 }
 
-fn read_config(dir: &Path) -> Result<Option<ModelConfig>, ModelError> {
+pub(crate) fn read_config(dir: &Path) -> Result<Option<ModelConfig>, ModelError> {
     #[derive(serde::Deserialize)]
     struct Sections {
         #[serde(default)]

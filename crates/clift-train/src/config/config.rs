@@ -244,7 +244,8 @@ pub struct Stage1Config {
     pub accumulate: usize,
     /// Smallest and largest share of the tokens that the renderer receives; the share is sampled every step.
     pub keep_tokens: [f64; 2],
-    /// Run or model directory, or `model.safetensors`, of the initial weights.
+    /// Run or model directory, or `model.safetensors`, of the initial weights. A network with patches half as long, or a third
+    /// and so on, is adapted: training goes on at a higher resolution.
     pub init_from: Option<PathBuf>,
     /// Settings of the optimizer.
     pub optimizer: OptimizerConfig,

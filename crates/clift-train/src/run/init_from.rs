@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_model::{ModelPath, Network, check_condenser, check_sizes, find_shipped, load_part, refuse_checkpoint};
+use clift_model::{ModelPath, Network, PatchAdapter, check_condenser, find_shipped, load_adapted, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};
 use crate::error::TrainError;
@@ -11,7 +11,8 @@ use crate::events::{Event, Sink, Stage};
 use crate::stage::interpolation::interpolate;
 
 /// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
-/// the same stage of another run, from a model directory, a weight file or the [shipped model](find_shipped). Reports which parameters were loaded.
+/// the same stage of another run, from a model directory, a weight file or the [shipped model](find_shipped), maybe through a
+/// [`PatchAdapter`]. Reports which parameters were loaded.
 pub(crate) fn init_from(
     mut model: Network,
     config: &Config,
@@ -32,13 +33,14 @@ pub(crate) fn init_from(
     let path: &Path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     refuse_checkpoint(path)?;
     // The sizes of a weight file without a config are unknown.
+    let mut adapter = PatchAdapter::default();
     if let Ok(found) = ModelPath::find(path) {
-        check_sizes(&config.model, &found.dir)?;
+        adapter = PatchAdapter::find(&config.model, &found.dir)?;
         if stage == Stage::Stage2 {
             check_condenser(&config.model, &found.dir)?;
         }
     }
-    let mut loaded = load_part(&mut model, &part, path)?;
+    let mut loaded = load_adapted(&mut model, &part, path, adapter)?;
     if loaded.applied.is_empty() {
         return Err(TrainError::bad_file(what, path)(lack));
     }
@@ -48,9 +50,10 @@ pub(crate) fn init_from(
         loaded.unused.retain(|name| part.matches(name));
     }
     sink.event(&Event::Message(format!(
-        "loaded {} parameters from {}; initialized, not in the file: {}; unused in the file: {}",
+        "loaded {} parameters from {}{}; initialized, not in the file: {}; unused in the file: {}",
         loaded.applied.len(),
         path.display(),
+        adapter.describe().map(|change| format!(", {change}")).unwrap_or_default(),
         list(&loaded.missing),
         list(&loaded.unused)
     )));
