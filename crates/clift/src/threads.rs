@@ -23,8 +23,8 @@ fn spawn(thread: ThreadBuilder) -> std::io::Result<std::thread::JoinHandle<()>> 
 }
 
 /// Calls `compute` with subnormal numbers (below 1.2e-38 in f32) read and written as zeros, on this thread and, on Linux, on the
-/// threads that it starts. A trained network has many of them, in attention weights and gradients, and Intel's processors take
-/// some hundred cycles for each: an update of a network after 775 steps took 5.2 s with them and 1.2 s without.
+/// threads that it starts. A trained network has many of them, and they are slow on some processors: on an Intel Xeon (family 6
+/// model 207), resuming a run at step 775, an update took 5.2 s with them and 1.2 s without.
 pub fn flush_subnormals<T>(compute: impl FnOnce() -> T) -> T {
     // SAFETY: the compiler may compute constants with subnormal numbers that the processor would make zeros. Nothing here
     // depends on which of the two it is.

@@ -25,7 +25,7 @@ impl ViewDistance {
         a.translation.distance(b.translation) / self.extent + a.rotation.z_axis.angle_between(b.rotation.z_axis)
     }
 
-    /// Returns the position of a view of `views` and those of the `num_views - 1` nearest others, in ascending order.
+    /// Returns the indices of view `seed` and of the `num_views - 1` views nearest to it, in ascending order.
     pub fn nearest(&self, views: &[Pose], seed: usize, num_views: usize) -> Vec<usize> {
         let mut others: Vec<usize> = (0..views.len()).filter(|&view| view != seed).collect();
         let to_seed = |view: usize| self.between(&views[view], &views[seed]);

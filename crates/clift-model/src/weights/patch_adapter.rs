@@ -16,8 +16,8 @@ use crate::weights::model_path::{check_equal_sizes, read_config};
 /// Adapts the layers between pixels and tokens to patches `factor` times as long, and from rays in the frame of the scene to rays
 /// in the frame of the camera. The default changes nothing.
 ///
-/// The network sees the mean of `factor` by `factor` pixels and renders each of its former pixels as so many. Moments of rays
-/// are left out: the frame of a scene is about that of its cameras.
+/// At first, the network sees the mean of every `factor` by `factor` pixels and repeats each pixel it renders as often. Rays in
+/// the frame of the camera keep the weights of directions and lose those of moments, which changes the image until it is trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PatchAdapter {
     /// Side of the patches in the file, in pixels.
@@ -34,8 +34,8 @@ impl Default for PatchAdapter {
 }
 
 impl PatchAdapter {
-    /// Returns what adapts the weights in `dir` to `model`, and checks that the networks have equal sizes otherwise. Any groups of
-    /// views will do.
+    /// Returns the adapter of the weights in `dir` to `model`, and checks that the networks have equal sizes otherwise. Groups of
+    /// views may differ.
     ///
     /// # Errors
     /// [`ModelError::BadConfig`] with the first other size, [`ModelError::BadConfigFile`] for a config that cannot be read.
@@ -69,9 +69,9 @@ impl PatchAdapter {
         (!changes.is_empty()).then(|| format!("adapted to {}", changes.join(" and ")))
     }
 
-    /// Returns the value of a patch vector in the file for every value of the longer one. Values have `num_colors` channels of
-    /// colour, then the coordinates of the ray where there are `rays`.
-    fn sources(&self, num_colors: usize, rays: bool) -> Vec<usize> {
+    /// Returns the length of a patch vector in the file, and which of its values each value of the longer vector comes from. A
+    /// pixel has `num_colors` channels of colour, then the coordinates of its ray if there are `rays`.
+    fn sources(&self, num_colors: usize, rays: bool) -> (usize, Vec<usize>) {
         let Self { patch_size, factor, drops_moments, .. } = *self;
         let num_coordinates = if rays { self.rays.num_coordinates() } else { 0 };
         let dropped = if rays && drops_moments { num_colors..num_colors + 3 } else { 0..0 };
@@ -79,7 +79,8 @@ impl PatchAdapter {
         let kept = (0..channels).filter(|channel| !dropped.contains(channel));
         let side = 0..factor * patch_size;
         let pixels = side.clone().flat_map(|y| side.clone().map(move |x| (y / factor) * patch_size + x / factor));
-        pixels.flat_map(|pixel| kept.clone().map(move |channel| pixel * channels + channel)).collect()
+        let sources = pixels.flat_map(|pixel| kept.clone().map(move |channel| pixel * channels + channel)).collect();
+        (patch_size * patch_size * channels, sources)
     }
 
     fn adapted(&self, tensor: &PackTensor) -> Option<PackTensor> {
@@ -91,7 +92,7 @@ impl PatchAdapter {
             "renderer.to_pixels.bias" => (3, false, 0, 1.0),
             _ => return None,
         };
-        let sources = self.sources(num_colors, rays);
+        let (expected_len, sources) = self.sources(num_colors, rays);
         let [rows, columns] = match tensor.shape[..] {
             [rows, columns] => [rows, columns],
             [rows] => [rows, 1],
@@ -99,7 +100,7 @@ impl PatchAdapter {
         };
         let len = if axis == 0 { rows } else { columns };
         // Another shape is an error of the file, with its own message.
-        if tensor.dtype != DType::F32 || sources.iter().any(|&source| source >= len) {
+        if tensor.dtype != DType::F32 || len != expected_len {
             return None;
         }
         let bytes = tensor.to_bytes().ok()?;
@@ -232,6 +233,10 @@ mod tests {
         assert!(described.unwrap().ends_with("pixels and rays in the frame of the camera instead of the scene"));
         let wrong = load(&config(3, RayFrame::World)).map(|_| ()).unwrap_err().to_string();
         assert!(wrong.starts_with("`model.patch_size` = 3: the weights are of a network with 2"), "{wrong}");
+        // Weights with longer patches than their config says.
+        save_weights(&Network::new(&config(4, RayFrame::World), 3, &Device::flex()), &path).unwrap();
+        let other = load(&config(8, RayFrame::World)).map(|_| ()).unwrap_err().to_string();
+        assert!(other.contains(" is [") && other.contains(", expected ["), "{other}");
         let wider = load(&ModelConfig { dim: 32, ..config(4, RayFrame::World) }).map(|_| ()).unwrap_err().to_string();
         assert!(wider.starts_with("`model.dim` = 32"), "{wider}");
     }
