@@ -172,7 +172,7 @@ impl Config {
 }
 
 fn validate_data(data: &DataConfig) -> Result<(), BadConfig> {
-    in_range("data.num_threads", data.num_threads, 0, 1024)?;
+    in_range("data.num_threads", data.num_threads.unwrap_or(0), 0, 1024)?;
     in_range("data.num_prefetch", data.num_prefetch, 1, 1024)?;
     if data.source == SourceKind::Synthetic {
         if let Some(root) = data.root.as_ref().filter(|root| !root.as_os_str().is_empty()) {

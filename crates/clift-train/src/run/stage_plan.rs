@@ -38,7 +38,8 @@ impl StagePlan<'_> {
     /// Starts to make the batches of the steps after `step`.
     pub(crate) fn prefetch(&self, step: u64) -> Prefetcher<StageBatch, TrainError> {
         let (data, make) = (&self.config.data, self.batches.clone());
-        Prefetcher::new(move |step| make(step), step, self.settings.steps, data.num_threads, data.num_prefetch)
+        let threads = data.loader_threads(self.config.device.is_cpu());
+        Prefetcher::new(move |step| make(step), step, self.settings.steps, threads, data.num_prefetch.max(threads))
     }
 
     /// Returns the learning rates of a step: `lr`, and for the renderer `lr` times its factor.
