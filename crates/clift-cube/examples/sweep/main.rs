@@ -75,7 +75,7 @@ fn run(sweep: &mut Sweep, class: AdapterClass, sizes: Sizes) {
     // Planes, and columns in matrices.
     let attention_tiles = shape.into_iter().flat_map(|shape| {
         let width = sizes.head_width;
-        [(8, 2), (4, 2), (8, 1), (4, 4), (2, 2)]
+        [(8, 2), (4, 2), (8, 1), (4, 4), (2, 4), (2, 2), (8, 4)]
             .map(|(planes, columns)| Some(AttentionTile { shape, planes, columns: columns * shape.sizes[0], width }))
     });
     let attention_tiles: Vec<Option<AttentionTile>> = attention_tiles.collect();
@@ -85,12 +85,12 @@ fn run(sweep: &mut Sweep, class: AdapterClass, sizes: Sizes) {
 
     let [forward, input, weight] = layers[0].products();
     forward.run(sweep, &matrices, Values::F32);
-    forward.run(sweep, &matrices, Values::F16);
     for direction in Direction::ALL {
         attentions[0].run(sweep, &attention_tiles, direction);
     }
-    input.run(sweep, &matrices, Values::F32);
     weight.run(sweep, &matrices, Values::F32);
+    input.run(sweep, &matrices, Values::F32);
+    forward.run(sweep, &matrices, Values::F16);
     rows::run(sweep, sizes);
     clusters::run(sweep, sizes);
     for product in layers[0].products() {

@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 use clift_cube::Buffer;
 use cubecl::prelude::Client;
 
+/// Time of launches before the samples: a GPU raises its clocks only under load.
+const WARM_UP: Duration = Duration::from_millis(300);
 /// Time of the launches between two waits, which take some 50 us.
 const SAMPLE: Duration = Duration::from_millis(4);
 /// Time of all samples.
@@ -90,6 +92,11 @@ impl<'a> Sweep<'a> {
         };
         let once = sample(1)?;
         let count = (SAMPLE.as_secs_f64() / once.as_secs_f64()).clamp(1.0, 64.0) as u32;
+        let start = Instant::now();
+        while start.elapsed() < WARM_UP {
+            sample(count)?;
+        }
+        let count = (SAMPLE.as_secs_f64() / sample(count)?.as_secs_f64()).clamp(1.0, 64.0) as u32;
         let (start, mut samples) = (Instant::now(), Vec::new());
         while samples.len() < 3 || (start.elapsed() < TOTAL && samples.len() < MAX_SAMPLES) {
             samples.push(sample(count)?.as_secs_f64());

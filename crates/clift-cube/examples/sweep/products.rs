@@ -14,20 +14,22 @@ pub fn register_tiles() -> Vec<ProductTile> {
 
 /// Returns the tiles of cooperative matrices, without such none.
 pub fn matrix_tiles(shape: Option<MatrixShape>) -> Vec<ProductTile> {
-    // Matrices of a stage, and planes.
-    let tiles: [([usize; 3], [usize; 2]); 9] = [
-        ([8, 8, 2], [2, 4]),
-        ([8, 8, 2], [2, 2]),
-        ([8, 8, 4], [2, 4]),
-        ([16, 8, 2], [4, 2]),
-        ([8, 16, 2], [2, 4]),
-        ([16, 16, 1], [4, 4]),
-        ([8, 4, 2], [2, 2]),
-        ([4, 8, 2], [2, 2]),
-        ([4, 4, 2], [2, 2]),
+    // Matrices of a stage, planes and buffers.
+    let tiles: [([usize; 3], [usize; 2], usize); 11] = [
+        ([8, 8, 2], [2, 4], 1),
+        ([8, 8, 2], [2, 2], 1),
+        ([8, 8, 2], [2, 4], 2),
+        ([8, 8, 2], [2, 2], 2),
+        ([8, 8, 4], [2, 2], 1),
+        ([8, 8, 4], [2, 4], 1),
+        ([16, 8, 2], [4, 2], 1),
+        ([8, 16, 2], [2, 4], 1),
+        ([8, 4, 2], [2, 2], 2),
+        ([4, 8, 2], [2, 2], 2),
+        ([4, 4, 2], [2, 2], 2),
     ];
-    let tile = |shape: MatrixShape, (stage, planes): ([usize; 3], [usize; 2])| {
-        ProductTile::Matrix(MatrixTile { shape, stage: stage.map(|count| count * shape.sizes[0]), planes })
+    let tile = |shape: MatrixShape, (stage, planes, buffers): ([usize; 3], [usize; 2], usize)| {
+        ProductTile::Matrix(MatrixTile { shape, stage: stage.map(|count| count * shape.sizes[0]), planes, buffers })
     };
     shape.into_iter().flat_map(|shape| tiles.map(|one| tile(shape, one))).collect()
 }
@@ -124,8 +126,8 @@ fn name(tile: ProductTile) -> String {
         ProductTile::Register(RegisterTile { stage: [m, n, k], unit: [rows, columns] }) => {
             format!("{m}x{n}x{k}, unit {rows}x{columns}")
         }
-        ProductTile::Matrix(MatrixTile { stage: [m, n, k], planes: [rows, columns], .. }) => {
-            format!("{m}x{n}x{k}, planes {rows}x{columns}")
+        ProductTile::Matrix(MatrixTile { stage: [m, n, k], planes: [rows, columns], buffers, .. }) => {
+            format!("{m}x{n}x{k}, planes {rows}x{columns}, {buffers} buffers")
         }
     }
 }

@@ -2,12 +2,12 @@
 
 use cubecl::prelude::*;
 
-use crate::adapter::AdapterClass;
 use crate::attention::head_rows::RowsLaunch;
 use crate::attention::matrix_attention as matrix;
 use crate::attention::matrix_scores::AttentionTile;
 use crate::attention::register_attention as register;
 use crate::attention::register_scores::{ROWS, UNITS};
+use crate::attention::tiles::attention_tiles;
 use crate::buffers::buffer::{Buffer, Values};
 use crate::buffers::elementwise::cast;
 
@@ -120,7 +120,7 @@ fn in_f16(client: &Client, buffers: [&Buffer; 3]) -> [Buffer; 3] {
 /// Computes `softmax(q k^T / sqrt(E)) v` of every head, `[batch, queries, heads E]` in f32, and the log sums of the scores,
 /// `[batch, heads, queries]`.
 pub fn attention_forward(client: &Client, sizes: AttentionSizes, inputs: &AttentionInputs) -> [Buffer; 2] {
-    let [forward, _] = AdapterClass::of(client).attention_tiles(sizes.operands, sizes.head_width);
+    let [forward, _] = attention_tiles(client, sizes.operands, sizes.head_width);
     attention_forward_tile(client, sizes, inputs, forward)
 }
 
@@ -198,7 +198,7 @@ pub fn attention_backward(
     results: AttentionResults,
     grads: &AttentionInputs,
 ) {
-    let [_, backward] = AdapterClass::of(client).attention_tiles(sizes.operands, sizes.head_width);
+    let [_, backward] = attention_tiles(client, sizes.operands, sizes.head_width);
     attention_backward_tile(client, sizes, inputs, results, grads, backward, AttentionGradients::All);
 }
 

@@ -12,7 +12,7 @@ use half::f16;
 use crate::attention::head_rows::{Rows, head_of_cube, read_rows};
 use crate::attention::matrix_scores::{
     AttentionTile, Scores, Stage, add_products, column_of_unit, load_rows, mask, max_of_plane, max_of_row, row_of_unit,
-    scale_sums, stage_block, sum_of_row, write_scores, write_sums, zero_sums,
+    scale_sums, stage_block, stage_transposed, sum_of_row, write_scores, write_sums, zero_sums,
 };
 use crate::buffers::load::Four;
 
@@ -38,7 +38,8 @@ pub(crate) fn forward<F: Float, V: Size>(
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
-    let mut stage = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut stage = Stage::new_slice(comptime!(tile.stage_lens()[0]));
+    let mut transposed = Stage::new_slice(comptime!(tile.stage_lens()[1]));
     let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
     let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
     let row = row_of_unit(tile);
@@ -58,10 +59,9 @@ pub(crate) fn forward<F: Float, V: Size>(
     while first < key_rows.count {
         sync_cube();
         stage_block::<F, V>(&mut stage, key, &key_rows, &head, first, tile);
+        stage_transposed::<F, V>(&mut transposed, value, &value_rows, &head, first, tile);
         sync_cube();
         write_scores(&mut scores, &queries, &stage, tile);
-        sync_cube();
-        stage_block::<F, V>(&mut stage, value, &value_rows, &head, first, tile);
         let mut largest = f32::new(f32::MIN);
         #[unroll]
         for i in 0..fours {
@@ -90,8 +90,8 @@ pub(crate) fn forward<F: Float, V: Size>(
             total += weight;
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(weight);
         }
-        sync_cube();
-        add_products(&sums, &weights, &stage, tile);
+        sync_plane();
+        add_products(&sums, &weights, &transposed, tile);
         first += tile.columns;
     }
 
@@ -129,8 +129,9 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
-    let mut keys = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
-    let mut values = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut keys = Stage::new_slice(comptime!(tile.stage_lens()[0]));
+    let mut values = Stage::new_slice(comptime!(tile.stage_lens()[0]));
+    let mut transposed_keys = Stage::new_slice(comptime!(tile.stage_lens()[1]));
     let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
     let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
     let row = row_of_unit(tile);
@@ -150,6 +151,7 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
     while first < key_rows.count {
         sync_cube();
         stage_block::<F, V>(&mut keys, key, &key_rows, &head, first, tile);
+        stage_transposed::<F, V>(&mut transposed_keys, key, &key_rows, &head, first, tile);
         stage_block::<F, V>(&mut values, value, &value_rows, &head, first, tile);
         sync_cube();
         write_scores(&mut scores, &queries, &keys, tile);
@@ -166,7 +168,7 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(mask(slope, first + column, key_rows.count));
         }
         sync_plane();
-        add_products(&sums, &weights, &keys, tile);
+        add_products(&sums, &weights, &transposed_keys, tile);
         first += tile.columns;
     }
     write_sums::<V>(grad_query, &sums, &mut scores, scale, &grad_rows, &head, first_row, tile);
@@ -195,8 +197,10 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
-    let mut queries = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
-    let mut grads = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut queries = Stage::new_slice(comptime!(tile.stage_lens()[0]));
+    let mut grads = Stage::new_slice(comptime!(tile.stage_lens()[0]));
+    let mut transposed_queries = Stage::new_slice(comptime!(tile.stage_lens()[1]));
+    let mut transposed_grads = Stage::new_slice(comptime!(tile.stage_lens()[1]));
     let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
     let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
     let row = row_of_unit(tile);
@@ -216,6 +220,8 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
         sync_cube();
         stage_block::<F, V>(&mut queries, query, &query_rows, &head, first, tile);
         stage_block::<G, V>(&mut grads, grad_output, &output_rows, &head, first, tile);
+        stage_transposed::<F, V>(&mut transposed_queries, query, &query_rows, &head, first, tile);
+        stage_transposed::<G, V>(&mut transposed_grads, grad_output, &output_rows, &head, first, tile);
         sync_cube();
         write_scores(&mut scores, &keys, &queries, tile);
         #[unroll]
@@ -227,7 +233,7 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(softmax[i]);
         }
         sync_plane();
-        add_products(&value_sums, &weights, &grads, tile);
+        add_products(&value_sums, &weights, &transposed_grads, tile);
         write_scores(&mut scores, &values, &grads, tile);
         #[unroll]
         for i in 0..fours {
@@ -237,7 +243,7 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(slope);
         }
         sync_plane();
-        add_products(&key_sums, &weights, &queries, tile);
+        add_products(&key_sums, &weights, &transposed_queries, tile);
         first += tile.columns;
     }
     write_sums::<V>(grad_key_value, &key_sums, &mut scores, scale, &grad_key_rows, &head, first_row, tile);

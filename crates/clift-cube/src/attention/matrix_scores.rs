@@ -8,7 +8,7 @@ use half::f16;
 use crate::adapter::MatrixShape;
 use crate::attention::head_rows::{Head, Rows, write_values};
 use crate::buffers::load::{Four, load_four};
-use crate::products::matrix_product::{PAD, StagedMatrix, load_matrix};
+use crate::products::matrix_product::{PAD, StagedMatrix, column_of_block, load_matrix};
 
 /// Tile of a cube.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -47,21 +47,30 @@ impl AttentionTile {
         self.width.next_multiple_of(self.shape.sizes[1].max(self.shape.sizes[2]))
     }
 
-    /// Values between two lines of a stage, rows of weights, and rows of scores.
+    /// Values between two lines of a stage, between rows of weights and lines of a transposed stage, and between rows of
+    /// scores.
     pub(crate) fn pitches(self) -> [usize; 3] {
         [self.padded() + PAD, self.columns + PAD, self.columns + 4]
     }
 
-    /// Rows, lines as the right operand of scores, weights, and lines as the right operand of sums.
-    pub(crate) fn staged(self) -> [StagedMatrix; 4] {
+    /// Lines as the right operand of scores, weights, and a transposed stage as the right operand of sums.
+    pub(crate) fn staged(self) -> [StagedMatrix; 3] {
         let [lines, weights, _] = self.pitches();
-        let staged = |ident, terms_inner, pitch| StagedMatrix { ident, terms_inner, pitch, shape: self.shape };
-        [
-            staged(MatrixIdent::A, true, lines),
-            staged(MatrixIdent::B, true, lines),
-            staged(MatrixIdent::A, true, weights),
-            staged(MatrixIdent::B, false, lines),
-        ]
+        let staged = |ident, pitch| StagedMatrix { ident, pitch, shape: self.shape };
+        [staged(MatrixIdent::B, lines), staged(MatrixIdent::A, weights), staged(MatrixIdent::B, weights)]
+    }
+
+    /// Vectors of a stage and of a transposed stage.
+    pub(crate) fn stage_lens(self) -> [usize; 2] {
+        let [lines, weights, _] = self.pitches();
+        [self.columns * lines / 4, self.padded() * weights / 4]
+    }
+
+    /// Bytes of shared memory of a kernel with a number of stages and of transposed stages, weights and scores.
+    pub fn shared_bytes(self, [stages, transposed]: [usize; 2]) -> usize {
+        let ([len, transposed_len], [_, weights, scores]) = (self.stage_lens(), self.pitches());
+        let halves = 4 * (stages * len + transposed * transposed_len) + self.rows() * weights;
+        2 * halves + 4 * (self.rows() * scores + self.units())
     }
 
     /// Matrices of a row along its terms, and along its values.
@@ -95,6 +104,40 @@ pub(crate) fn stage_block<E: Numeric, V: Size>(
             let value = group % fours * 4;
             stage[line * comptime!(tile.pitches()[0] / 4) + value / 4] =
                 load_four::<E, V, f16>(from, start, lines.stride, first + line, value, lines.count, tile.width);
+        }
+    }
+}
+
+/// Copies a block of lines to shared memory, transposed: a line of the stage has a value of every line of the block.
+#[cube]
+pub(crate) fn stage_transposed<E: Numeric, V: Size>(
+    stage: &mut [Four<f16>],
+    from: &[Vector<E, V>],
+    lines: &Rows,
+    head: &Head,
+    first: usize,
+    #[comptime] tile: AttentionTile,
+) {
+    let fours = comptime!(tile.columns / 4);
+    let blocks = comptime!(tile.padded() / 4 * fours);
+    let units = comptime!(tile.units());
+    let pitch = comptime!(tile.pitches()[1] / 4);
+    let start = lines.start_of(head);
+    #[unroll]
+    for step in 0..comptime!(blocks.div_ceil(units)) {
+        let block = UNIT_POS as usize + step * units;
+        if comptime!(blocks.is_multiple_of(units)) || block < blocks {
+            let line = first + block % fours * 4;
+            let value = block / fours * 4;
+            let mut rows = Array::<Four<f16>>::new(4usize);
+            #[unroll]
+            for j in 0..4usize {
+                rows[j] = load_four::<E, V, f16>(from, start, lines.stride, line + j, value, lines.count, tile.width);
+            }
+            #[unroll]
+            for i in 0..4usize {
+                stage[(value + i) * pitch + block % fours] = column_of_block(rows[0], rows[1], rows[2], rows[3], i);
+            }
         }
     }
 }
@@ -165,7 +208,7 @@ pub(crate) fn write_scores(
     for e in 0..comptime!(tile.matrices()[0]) {
         #[unroll]
         for j in 0..blocks {
-            let b = load_matrix(stage, j * n, e * k, comptime!(tile.staged()[1]));
+            let b = load_matrix(stage, j * n, e * k, comptime!(tile.staged()[0]));
             cmma::execute(rows.index(e), &b, sums.index(j), sums.index(j));
         }
     }
@@ -180,7 +223,7 @@ pub(crate) fn write_scores(
     sync_plane();
 }
 
-/// Adds the products of the plane's weights and the lines of a stage.
+/// Adds the products of the plane's weights and the lines of a transposed stage.
 #[cube]
 pub(crate) fn add_products(
     sums: &Sequence<Matrix<f32>>,
@@ -191,10 +234,10 @@ pub(crate) fn add_products(
     let [_, n, k] = comptime!(tile.shape.sizes);
     #[unroll]
     for c in 0..comptime!(tile.columns / k) {
-        let a = load_matrix(weights, first_row_of_plane(tile), c * k, comptime!(tile.staged()[2]));
+        let a = load_matrix(weights, first_row_of_plane(tile), c * k, comptime!(tile.staged()[1]));
         #[unroll]
         for j in 0..comptime!(tile.matrices()[1]) {
-            let b = load_matrix(stage, j * n, c * k, comptime!(tile.staged()[3]));
+            let b = load_matrix(stage, j * n, c * k, comptime!(tile.staged()[2]));
             cmma::execute(&a, &b, sums.index(j), sums.index(j));
         }
     }

@@ -24,6 +24,8 @@ pub struct MatrixTile {
     pub stage: [usize; 3],
     /// Rows and columns of planes.
     pub planes: [usize; 2],
+    /// Stages in shared memory: 2 let planes write the next stage while others read the last one.
+    pub buffers: usize,
 }
 
 impl MatrixTile {
@@ -37,84 +39,122 @@ impl MatrixTile {
     }
 }
 
-/// Reads lines of an operand into registers.
-#[cube]
-pub(crate) fn fetch_lines<E: Numeric, V: Size>(
-    to: &mut Array<Four<f16>>,
-    from: &[Vector<E, V>],
-    start: usize,
-    stride: usize,
-    first_line: usize,
-    first_value: usize,
-    line_limit: usize,
-    value_limit: usize,
-    #[comptime] lines: usize,
-    #[comptime] values: usize,
-    #[comptime] units: usize,
-) {
-    let groups = comptime!(lines * values / 4);
-    #[unroll]
-    for step in 0..groups.div_ceil(units) {
-        let group = UNIT_POS as usize + step * units;
-        let mut four = Four::<f16>::new(f16::new(0.0));
-        if comptime!(groups.is_multiple_of(units)) || group < groups {
-            let line = first_line + group / (values / 4);
-            let value = first_value + group % (values / 4) * 4;
-            four = load_four::<E, V, f16>(from, start, stride, line, value, line_limit, value_limit);
-        }
-        to[step] = four;
+/// An operand's part of a stage: lines of the terms of a row or a column.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct StagePart {
+    /// The terms lie side by side in the buffer, too.
+    terms_inner: bool,
+    sides: usize,
+    terms: usize,
+    units: usize,
+}
+
+impl StagePart {
+    /// Vectors that a unit copies at once: one, or a block of 4 x 4 values that it transposes.
+    fn block(self) -> usize {
+        if self.terms_inner { 1 } else { 4 }
+    }
+
+    fn blocks(self) -> usize {
+        self.sides * self.terms / 4 / self.block()
+    }
+
+    /// Vectors of a unit.
+    fn fetches(self) -> usize {
+        self.blocks().div_ceil(self.units) * self.block()
+    }
+
+    /// Vectors of a line.
+    fn pitch(self) -> usize {
+        (self.terms + PAD) / 4
+    }
+
+    /// Vectors of the stage.
+    fn len(self) -> usize {
+        self.sides * self.pitch()
     }
 }
 
-/// Reads an operand's part of a stage, as [`fetch_lines`].
+/// Reads an operand's part of a stage into registers.
 #[cube]
-fn fetch_operand<E: Numeric, V: Size>(
+fn fetch<E: Numeric, V: Size>(
     to: &mut Array<Four<f16>>,
     from: &[Vector<E, V>],
     start: usize,
     stride: usize,
-    side: usize,
-    term: usize,
+    first_side: usize,
+    first_term: usize,
     side_limit: usize,
     term_limit: usize,
-    #[comptime] terms_inner: bool,
-    #[comptime] sides: usize,
-    #[comptime] terms: usize,
-    #[comptime] units: usize,
+    #[comptime] part: StagePart,
 ) {
-    if comptime!(terms_inner) {
-        fetch_lines::<E, V>(to, from, start, stride, side, term, side_limit, term_limit, sides, terms, units);
-    } else {
-        fetch_lines::<E, V>(to, from, start, stride, term, side, term_limit, side_limit, terms, sides, units);
-    }
-}
-
-/// Writes the values that [`fetch_lines`] read into a stage.
-#[cube]
-pub(crate) fn put_lines(
-    stage: &mut [Four<f16>],
-    from: &Array<Four<f16>>,
-    #[comptime] lines: usize,
-    #[comptime] values: usize,
-    #[comptime] units: usize,
-) {
-    let groups = comptime!(lines * values / 4);
-    let pitch = comptime!((values + PAD) / 4);
+    let (blocks, block) = comptime!((part.blocks(), part.block()));
     #[unroll]
-    for step in 0..groups.div_ceil(units) {
-        let group = UNIT_POS as usize + step * units;
-        if comptime!(groups.is_multiple_of(units)) || group < groups {
-            stage[group / (values / 4) * pitch + group % (values / 4)] = from[step];
+    for step in 0..blocks.div_ceil(part.units) {
+        let index = UNIT_POS as usize + step * part.units;
+        let side = first_side + index / (part.terms / 4) * block;
+        let term = first_term + index % (part.terms / 4) * 4;
+        #[unroll]
+        for j in 0..block {
+            let mut four = Four::<f16>::new(f16::new(0.0));
+            if comptime!(blocks.is_multiple_of(part.units)) || index < blocks {
+                four = if comptime!(part.terms_inner) {
+                    load_four::<E, V, f16>(from, start, stride, side, term, side_limit, term_limit)
+                } else {
+                    load_four::<E, V, f16>(from, start, stride, term + j, side, term_limit, side_limit)
+                };
+            }
+            to[step * block + j] = four;
         }
     }
 }
 
-/// Operand of a product of matrices, and its layout in a stage.
+/// Writes the values that [`fetch`] read into the stage at `first`.
+#[cube]
+fn put(stage: &mut [Four<f16>], from: &Array<Four<f16>>, first: usize, #[comptime] part: StagePart) {
+    let (blocks, block) = comptime!((part.blocks(), part.block()));
+    #[unroll]
+    for step in 0..blocks.div_ceil(part.units) {
+        let index = UNIT_POS as usize + step * part.units;
+        if comptime!(blocks.is_multiple_of(part.units)) || index < blocks {
+            let side = index / (part.terms / 4) * block;
+            let term = index % (part.terms / 4);
+            if comptime!(part.terms_inner) {
+                stage[first + side * part.pitch() + term] = from[step];
+            } else {
+                #[unroll]
+                for i in 0..4usize {
+                    let row = step * 4;
+                    let four = column_of_block(from[row], from[row + 1], from[row + 2], from[row + 3], i);
+                    stage[first + (side + i) * part.pitch() + term] = four;
+                }
+            }
+        }
+    }
+}
+
+/// Returns a column of four rows.
+#[cube]
+pub(crate) fn column_of_block(
+    first: Four<f16>,
+    second: Four<f16>,
+    third: Four<f16>,
+    fourth: Four<f16>,
+    #[comptime] column: usize,
+) -> Four<f16> {
+    let mut values = Four::<f16>::new(f16::new(0.0));
+    values.insert(0usize, first.extract(column));
+    values.insert(1usize, second.extract(column));
+    values.insert(2usize, third.extract(column));
+    values.insert(3usize, fourth.extract(column));
+    values
+}
+
+/// Operand of a product of matrices in a stage. The terms of a sum lie side by side: for other layouts NVIDIA's driver takes
+/// twice the time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct StagedMatrix {
     pub(crate) ident: MatrixIdent,
-    /// A line has the terms of a sum.
-    pub(crate) terms_inner: bool,
     /// Values between two lines.
     pub(crate) pitch: usize,
     pub(crate) shape: MatrixShape,
@@ -122,8 +162,7 @@ pub(crate) struct StagedMatrix {
 
 impl StagedMatrix {
     fn layout(self) -> MatrixLayout {
-        let is_lhs = self.ident == MatrixIdent::A;
-        if is_lhs == self.terms_inner { MatrixLayout::RowMajor } else { MatrixLayout::ColMajor }
+        if self.ident == MatrixIdent::A { MatrixLayout::RowMajor } else { MatrixLayout::ColMajor }
     }
 }
 
@@ -139,7 +178,7 @@ pub(crate) fn load_matrix(
     // SAFETY: the matrix is loaded below.
     let mut matrix =
         unsafe { Matrix::<f16>::uninitialized(comptime!(staged.ident), m, n, k, comptime!(staged.layout())) };
-    let first = if comptime!(staged.terms_inner) { side * staged.pitch + term } else { term * staged.pitch + side };
+    let first = side * staged.pitch + term;
     cmma::load(&mut matrix, &stage[first / 4..stage.len()], comptime!(staged.pitch as u32));
     matrix
 }
@@ -179,21 +218,14 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     let lhs_start = lhs_lines.start + batch * lhs_lines.batch_stride;
     let rhs_start = rhs_lines.start + batch * rhs_lines.batch_stride;
 
-    // Lines and values of the stages.
-    let lhs_inner = comptime!(kind.lhs.terms_inner);
-    let rhs_inner = comptime!(kind.rhs.terms_inner);
-    let (lhs_count, lhs_values) = comptime!(if lhs_inner { (m, k) } else { (k, m) });
-    let (rhs_count, rhs_values) = comptime!(if rhs_inner { (n, k) } else { (k, n) });
-    let lhs_pitch = comptime!(lhs_values + PAD);
-    let rhs_pitch = comptime!(rhs_values + PAD);
-    let mut lhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(lhs_count * lhs_pitch / 4));
-    let mut rhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(rhs_count * rhs_pitch / 4));
-    let lhs_staged =
-        comptime!(StagedMatrix { ident: MatrixIdent::A, terms_inner: lhs_inner, pitch: lhs_pitch, shape: tile.shape });
-    let rhs_staged =
-        comptime!(StagedMatrix { ident: MatrixIdent::B, terms_inner: rhs_inner, pitch: rhs_pitch, shape: tile.shape });
-    let mut lhs_next = Array::<Four<f16>>::new(comptime!((m * k / 4).div_ceil(units)));
-    let mut rhs_next = Array::<Four<f16>>::new(comptime!((n * k / 4).div_ceil(units)));
+    let lhs_part = comptime!(StagePart { terms_inner: kind.lhs.terms_inner, sides: m, terms: k, units });
+    let rhs_part = comptime!(StagePart { terms_inner: kind.rhs.terms_inner, sides: n, terms: k, units });
+    let mut lhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(tile.buffers * lhs_part.len()));
+    let mut rhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(tile.buffers * rhs_part.len()));
+    let lhs_staged = comptime!(StagedMatrix { ident: MatrixIdent::A, pitch: k + PAD, shape: tile.shape });
+    let rhs_staged = comptime!(StagedMatrix { ident: MatrixIdent::B, pitch: k + PAD, shape: tile.shape });
+    let mut lhs_next = Array::<Four<f16>>::new(comptime!(lhs_part.fetches()));
+    let mut rhs_next = Array::<Four<f16>>::new(comptime!(rhs_part.fetches()));
 
     let plane = UNIT_POS as usize / plane_units;
     let lane = UNIT_POS as usize % plane_units;
@@ -207,78 +239,44 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     }
 
     let mut term = first_term;
-    fetch_operand::<A, VA>(
-        &mut lhs_next,
-        lhs,
-        lhs_start,
-        lhs_lines.stride,
-        first_row,
-        term,
-        sizes.rows,
-        last_term,
-        lhs_inner,
-        m,
-        k,
-        units,
-    );
-    fetch_operand::<B, VB>(
-        &mut rhs_next,
-        rhs,
-        rhs_start,
-        rhs_lines.stride,
-        first_column,
-        term,
-        sizes.columns,
-        last_term,
-        rhs_inner,
-        n,
-        k,
-        units,
-    );
+    let mut buffer = 0usize;
+    let (lhs_stride, rhs_stride) = (lhs_lines.stride, rhs_lines.stride);
+    fetch::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_stride, first_row, term, sizes.rows, last_term, lhs_part);
+    fetch::<B, VB>(&mut rhs_next, rhs, rhs_start, rhs_stride, first_column, term, sizes.columns, last_term, rhs_part);
     while term < last_term {
+        if comptime!(tile.buffers == 1) {
+            sync_cube();
+        }
+        let (lhs_first, rhs_first) = (buffer * comptime!(lhs_part.len()), buffer * comptime!(rhs_part.len()));
+        put(&mut lhs_stage, &lhs_next, lhs_first, lhs_part);
+        put(&mut rhs_stage, &rhs_next, rhs_first, rhs_part);
         sync_cube();
-        put_lines(&mut lhs_stage, &lhs_next, lhs_count, lhs_values, units);
-        put_lines(&mut rhs_stage, &rhs_next, rhs_count, rhs_values, units);
-        sync_cube();
+        let lhs_now = &lhs_stage[lhs_first..lhs_stage.len()];
+        let rhs_now = &rhs_stage[rhs_first..rhs_stage.len()];
+        buffer = (buffer + 1) % tile.buffers;
         term += k;
-        fetch_operand::<A, VA>(
-            &mut lhs_next,
-            lhs,
-            lhs_start,
-            lhs_lines.stride,
-            first_row,
-            term,
-            sizes.rows,
-            last_term,
-            lhs_inner,
-            m,
-            k,
-            units,
-        );
-        fetch_operand::<B, VB>(
+        fetch::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_stride, first_row, term, sizes.rows, last_term, lhs_part);
+        fetch::<B, VB>(
             &mut rhs_next,
             rhs,
             rhs_start,
-            rhs_lines.stride,
+            rhs_stride,
             first_column,
             term,
             sizes.columns,
             last_term,
-            rhs_inner,
-            n,
-            k,
-            units,
+            rhs_part,
         );
         #[unroll]
         for t in 0..comptime!(k / sk) {
             let mut b = Sequence::<Matrix<f16>>::new();
             #[unroll]
             for j in 0..columns {
-                b.push(load_matrix(&rhs_stage, plane_column + j * sn, t * sk, rhs_staged));
+                b.push(load_matrix(rhs_now, plane_column + j * sn, t * sk, rhs_staged));
             }
             #[unroll]
             for i in 0..rows {
-                let a = load_matrix(&lhs_stage, plane_row + i * sm, t * sk, lhs_staged);
+                let a = load_matrix(lhs_now, plane_row + i * sm, t * sk, lhs_staged);
                 #[unroll]
                 for j in 0..columns {
                     let sum = &sums[i * columns + j];
@@ -302,7 +300,7 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
                 sn as u32,
                 MatrixLayout::RowMajor,
             );
-            sync_cube();
+            sync_plane();
             #[unroll]
             for step in 0..comptime!((sm * sn / 4).div_ceil(plane_units)) {
                 let four = lane + step * plane_units;
@@ -321,7 +319,7 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
                     comptime!(kind.epilogue),
                 );
             }
-            sync_cube();
+            sync_plane();
         }
     }
 }

@@ -13,8 +13,11 @@ use crate::products::product_kind::{OperandKind, ProductKind, SizesLaunch};
 use crate::products::register_product::register_product;
 use crate::products::tiles::ProductTile;
 
-/// Tiles of the output below which long sums are split, so that more processors of the adapter have work; not tuned.
-const MIN_TILES: usize = 96;
+/// Most tiles of an output whose long sums are split, so that all processors of the adapter have work: an H100 has 132, each
+/// with room for several tiles.
+const FEW_TILES: usize = 128;
+/// Tiles and splits of such an output.
+const MIN_TILES: usize = 384;
 /// Fewest stages of a split.
 const MIN_STAGES: usize = 16;
 
@@ -76,7 +79,8 @@ impl<'a> Product<'a> {
     fn splits(&self, tile: ProductTile) -> Splits {
         let ([m, n, k], [tile_m, tile_n, tile_k]) = (self.sizes, tile.stage());
         let tiles = self.batch * m.div_ceil(tile_m) * n.div_ceil(tile_n);
-        let count = MIN_TILES.div_ceil(tiles).min(k.div_ceil(tile_k * MIN_STAGES)).max(1);
+        let wanted = if tiles > FEW_TILES { 1 } else { MIN_TILES.div_ceil(tiles) };
+        let count = wanted.min(k.div_ceil(tile_k * MIN_STAGES)).max(1);
         let terms = k.div_ceil(count).next_multiple_of(tile_k);
         Splits { count: k.div_ceil(terms).max(1), terms }
     }

@@ -16,7 +16,7 @@ impl AdapterClass {
                     (16, _) => ([64, 64, 32], [2, 2]),
                     _ => ([32, 32, 16], [2, 2]),
                 };
-                ProductTile::Matrix(MatrixTile { shape, stage, planes })
+                ProductTile::Matrix(MatrixTile { shape, stage, planes, buffers: 1 })
             }
             _ if m.min(n) >= 96 => ProductTile::Register(RegisterTile { stage: [128, 128, 16], unit: [8, 8] }),
             _ => ProductTile::Register(RegisterTile { stage: [64, 64, 16], unit: [4, 4] }),
