@@ -64,7 +64,7 @@ pub use step::batch::{BatchTokens, StageBatch};
 pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{Loss, LossParts, LossTerm, Rendering, mse};
 pub use step::loss_scale::LossScale;
-pub use step::optimizer::{StageOptimizer, clip_global_norm, global_norm};
+pub use step::optimizer::{StageOptimizer, clip_factor, global_norm};
 pub use step::schedule::learning_rate;
 pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};

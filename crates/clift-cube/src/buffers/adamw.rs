@@ -1,9 +1,9 @@
-//! AdamW and the norm of gradients, one launch a tensor each.
+//! AdamW, a launch a tensor, and the norm of gradients, a launch for several tensors.
 
 use cubecl::prelude::*;
 
 use crate::buffers::buffer::{Buffer, Values};
-use crate::buffers::elementwise::{UNITS, cube_count, elementwise};
+use crate::buffers::elementwise::{UNITS, elementwise};
 use crate::buffers::reduce::{sum_of_row, sum_of_vector};
 
 /// Vectors that a unit adds.
@@ -26,6 +26,8 @@ pub struct AdamW {
     pub correction_2: f32,
     /// Added to the root of the mean square.
     pub epsilon: f32,
+    /// Factor of the gradient.
+    pub grad_factor: f32,
 }
 
 #[cube(launch_unchecked)]
@@ -42,7 +44,7 @@ fn update<V: Size>(
     let index = ABSOLUTE_POS;
     if index < grad.len() {
         let one = Vector::<f32, V>::new(1.0);
-        let grad = grad[index];
+        let grad = grad[index] * Vector::<f32, V>::new(rates.grad_factor);
         let old = Vector::<f32, V>::new(rates.beta_1);
         let mean = old * mean[index] + (one - old) * grad;
         let old = Vector::<f32, V>::new(rates.beta_2);
@@ -61,7 +63,8 @@ pub fn adamw(client: &Client, settings: AdamW, inputs: [&Buffer; 3], grad: &Buff
     let outputs = inputs.map(|input| Buffer::empty(client, input.len, Values::F32));
     let ([parameter, mean, square], [new_parameter, new_mean, new_square]) = (inputs, &outputs);
     let (vector, count) = elementwise(grad.len);
-    let AdamW { learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon } = settings;
+    let AdamW { learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon, grad_factor } =
+        settings;
     // SAFETY: the kernel compares its index with the length.
     unsafe {
         update::launch_unchecked(
@@ -76,29 +79,64 @@ pub fn adamw(client: &Client, settings: AdamW, inputs: [&Buffer; 3], grad: &Buff
             new_parameter.arg(vector),
             new_mean.arg(vector),
             new_square.arg(vector),
-            AdamWLaunch::new(learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon),
+            AdamWLaunch::new(
+                learning_rate,
+                weight_decay,
+                beta_1,
+                beta_2,
+                correction_1,
+                correction_2,
+                epsilon,
+                grad_factor,
+            ),
         );
     }
     outputs
 }
 
-/// Writes the sum of the squares of a chunk of the values to `sums[first + cube]`.
-#[cube(launch_unchecked)]
-fn add_squares<V: Size>(x: &[Vector<f32, V>], sums: &mut [f32], first: usize, count: usize) {
-    let cube = CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize;
-    let mut stage = Shared::<[f32]>::new_slice(UNITS);
+/// Tensors of a launch.
+const GROUP: usize = 8;
+
+/// Returns the sum of the squares of a chunk of the values, in unit 0 of the cube.
+#[cube]
+fn squares<V: Size>(x: &[Vector<f32, V>], stage: &mut Shared<[f32]>) -> f32 {
     let mut sum = Vector::<f32, V>::new(0.0);
     for i in 0..VECTORS {
-        let index = (cube * VECTORS + i) * UNITS + UNIT_POS as usize;
+        let index = (CUBE_POS_X as usize * VECTORS + i) * UNITS + UNIT_POS as usize;
         if index < x.len() {
             sum += x[index] * x[index];
         }
     }
-    let sum = sum_of_row(sum_of_vector(sum), &mut stage, UNITS);
+    sum_of_row(sum_of_vector(sum), stage, UNITS)
+}
+
+/// Writes the sum of the squares of a chunk of a tensor to `sums[first + cube]`; a row of cubes has a tensor.
+#[cube(launch_unchecked)]
+fn add_squares<V: Size>(
+    a: &[Vector<f32, V>],
+    b: &[Vector<f32, V>],
+    c: &[Vector<f32, V>],
+    d: &[Vector<f32, V>],
+    e: &[Vector<f32, V>],
+    f: &[Vector<f32, V>],
+    g: &[Vector<f32, V>],
+    h: &[Vector<f32, V>],
+    sums: &mut [f32],
+    first: usize,
+) {
+    let mut stage = Shared::<[f32]>::new_slice(UNITS);
+    let sum = match CUBE_POS_Y {
+        0 => squares(a, &mut stage),
+        1 => squares(b, &mut stage),
+        2 => squares(c, &mut stage),
+        3 => squares(d, &mut stage),
+        4 => squares(e, &mut stage),
+        5 => squares(f, &mut stage),
+        6 => squares(g, &mut stage),
+        _ => squares(h, &mut stage),
+    };
     if UNIT_POS == 0 {
-        if cube < count {
-            sums[first + cube] = sum;
-        }
+        sums[first + (CUBE_POS_Y * CUBE_COUNT_X + CUBE_POS_X) as usize] = sum;
     }
 }
 
@@ -120,29 +158,44 @@ fn finish_norm(sums: &[f32], norm: &mut [f32]) {
 
 /// Computes the norm of all gradients together, `[1]`.
 pub fn gradient_norm(client: &Client, grads: &[Buffer]) -> Buffer {
-    let chunks = |x: &Buffer| {
-        let vector = if x.len.is_multiple_of(4) { 4 } else { 1 };
-        (vector, (x.len / vector).div_ceil(UNITS * VECTORS))
+    let vector = |x: &Buffer| if x.len.is_multiple_of(4) { 4 } else { 1 };
+    // Tensors of a launch have similar lengths.
+    let mut grads: Vec<&Buffer> = grads.iter().collect();
+    grads.sort_by_key(|x| (vector(x), x.len));
+    let groups: Vec<&[&Buffer]> =
+        grads.chunk_by(|a, b| vector(a) == vector(b)).flat_map(|all| all.chunks(GROUP)).collect();
+    let chunks = |group: &[&Buffer]| {
+        let longest = group.iter().map(|x| x.len).max().unwrap_or(0);
+        (longest / vector(group[0])).div_ceil(UNITS * VECTORS).max(1)
     };
-    let sums = Buffer::empty(client, grads.iter().map(|x| chunks(x).1).sum(), Values::F32);
-    let norm = Buffer::empty(client, 1, Values::F32);
+    let counts: Vec<usize> = groups.iter().map(|group| chunks(group)).collect();
+    let len = groups.iter().zip(&counts).map(|(group, count)| group.len() * count).sum();
+    let (sums, norm) = (Buffer::empty(client, len, Values::F32), Buffer::empty(client, 1, Values::F32));
     let dim = CubeDim::new_1d(UNITS as u32);
     let mut first = 0;
     // SAFETY: the kernels compare their indices with the lengths.
     unsafe {
-        for x in grads {
-            let (vector, count) = chunks(x);
+        for (group, count) in groups.iter().zip(counts) {
+            let vector = vector(group[0]);
+            // Rows of cubes stand only for the tensors of the group; the last one fills the other arguments.
+            let arg = |i: usize| group[i.min(group.len() - 1)].arg(vector);
             add_squares::launch_unchecked(
                 client,
-                cube_count(count),
+                CubeCount::Static(count as u32, group.len() as u32, 1),
                 dim,
                 vector,
-                x.arg(vector),
+                arg(0),
+                arg(1),
+                arg(2),
+                arg(3),
+                arg(4),
+                arg(5),
+                arg(6),
+                arg(7),
                 sums.arg(1),
                 first,
-                count,
             );
-            first += count;
+            first += group.len() * count;
         }
         finish_norm::launch_unchecked(client, CubeCount::Static(1, 1, 1), dim, sums.arg(1), norm.arg(1));
     }
@@ -165,6 +218,7 @@ mod tests {
             correction_1: 0.1,
             correction_2: 0.05,
             epsilon: 1e-8,
+            grad_factor: 0.5,
         };
         for len in [1, 37, 5000] {
             let values = [1, 2, 3, 4].map(|seed| random(len, seed));
@@ -173,7 +227,7 @@ mod tests {
             let grad = upload(&client, &values[3], Values::F32);
             let results = adamw(&client, settings, inputs.each_ref(), &grad);
             let expected = (0..len).map(|i| {
-                let [p, m, s, g] = [values[0][i], values[1][i], square[i], values[3][i]].map(f64::from);
+                let [p, m, s, g] = [values[0][i], values[1][i], square[i], 0.5 * values[3][i]].map(f64::from);
                 let (m, s) = (0.9 * m + 0.1 * g, 0.95 * s + 0.05 * g * g);
                 [p * (1.0 - 1e-2 * 0.05) - 1e-2 * (m / 0.1) / ((s / 0.05).sqrt() + 1e-8), m, s]
             });
@@ -189,8 +243,9 @@ mod tests {
     #[test]
     fn the_norm_is_that_of_all_gradients() {
         let Some(client) = client() else { return };
-        let grads = [(5, 1), (40_000, 2), (37, 3)].map(|(len, seed)| random(len, seed));
-        let buffers = grads.each_ref().map(|x| upload(&client, x, Values::F32));
+        let lens = [5, 40_000, 37, 8, 12, 400, 16, 70_000, 20, 24, 28, 32];
+        let grads: Vec<Vec<f32>> = lens.iter().enumerate().map(|(seed, &len)| random(len, seed as u64)).collect();
+        let buffers: Vec<Buffer> = grads.iter().map(|x| upload(&client, x, Values::F32)).collect();
         let norm = grads.iter().flatten().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
         assert!(worst(&read(&client, &gradient_norm(&client, &buffers)), &[norm]) < 1e-6);
     }

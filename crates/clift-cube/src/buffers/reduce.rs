@@ -93,28 +93,47 @@ fn sum_chunks<V: Size>(
     }
 }
 
+/// Units that add the same column.
+const LANES: usize = 8;
+/// Columns of a cube.
+const COLUMNS: usize = 32;
+
 /// Sums over the first and the third dimension: `[chunks, parts, repeats, width] -> [parts, width]`. The chunks are `stride`
-/// values apart.
+/// values apart. The second row of cubes sums the values after `columns` to `second`.
 #[cube(launch_unchecked)]
 fn sum_partial(
     partial: &[f32],
-    sums: &mut [f32],
-    start: usize,
+    first: &mut [f32],
+    second: &mut [f32],
+    columns: usize,
     stride: usize,
     chunks: usize,
     repeats: usize,
     width: usize,
 ) {
-    let index = ABSOLUTE_POS;
-    if index < sums.len() {
-        let first = start + index / width * repeats * width + index % width;
-        let mut sum = 0.0f32;
-        for i in 0..chunks {
-            for j in 0..repeats {
-                sum += partial[i * stride + first + j * width];
-            }
+    let mut stage = Shared::<[f32]>::new_slice(comptime!(LANES * COLUMNS));
+    let index = CUBE_POS_X as usize * COLUMNS + UNIT_POS as usize % COLUMNS;
+    let lane = UNIT_POS as usize / COLUMNS;
+    let mut sum = 0.0f32;
+    if index < first.len() {
+        let start = CUBE_POS_Y as usize * columns + index / width * repeats * width + index % width;
+        let mut i = lane;
+        while i < chunks * repeats {
+            sum += partial[i / repeats * stride + start + i % repeats * width];
+            i += LANES;
         }
-        sums[index] = sum;
+    }
+    stage[UNIT_POS as usize] = sum;
+    sync_cube();
+    if lane == 0 && index < first.len() {
+        for i in 1..LANES {
+            sum += stage[i * COLUMNS + UNIT_POS as usize];
+        }
+        if CUBE_POS_Y == 0 {
+            first[index] = sum;
+        } else {
+            second[index] = sum;
+        }
     }
 }
 
@@ -158,26 +177,25 @@ pub(crate) fn sum_over_rows(
             term,
         );
     }
-    let sum = |i: usize| {
-        let sums = Buffer::empty(client, columns / repeats, Values::F32);
-        // SAFETY: as above.
-        unsafe {
-            sum_partial::launch_unchecked(
-                client,
-                CubeCount::Static((columns / repeats).div_ceil(UNITS) as u32, 1, 1),
-                CubeDim::new_1d(UNITS as u32),
-                partial.arg(1),
-                sums.arg(1),
-                i * columns,
-                num_sums * columns,
-                chunks,
-                repeats,
-                width,
-            );
-        }
-        sums
-    };
-    (0..num_sums).map(sum).collect()
+    let len = columns / repeats;
+    let sums = [len, if num_sums == 2 { len } else { 1 }].map(|len| Buffer::empty(client, len, Values::F32));
+    // SAFETY: as above.
+    unsafe {
+        sum_partial::launch_unchecked(
+            client,
+            CubeCount::Static(len.div_ceil(COLUMNS) as u32, num_sums as u32, 1),
+            CubeDim::new_1d((LANES * COLUMNS) as u32),
+            partial.arg(1),
+            sums[0].arg(1),
+            sums[1].arg(1),
+            columns,
+            num_sums * columns,
+            chunks,
+            repeats,
+            width,
+        );
+    }
+    sums.into_iter().take(num_sums).collect()
 }
 
 /// Sums over the rows of `x: [rows, columns]`, the gradient of a bias.

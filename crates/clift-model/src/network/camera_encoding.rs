@@ -12,6 +12,7 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use crate::network::architecture::CameraEncoding;
 use crate::network::config::ModelConfig;
 use crate::ops::head_transform::{KEY_VALUE, OUTPUT, QUERY, QUERY_KEY_VALUE, transform_heads};
+use crate::ops::matmul::matmul_without_gradient;
 use crate::views::upload::Cameras;
 
 /// Wave lengths of the rotations by row and column, in patches: from `2 pi` to `2 pi * LONGEST`.
@@ -113,9 +114,9 @@ fn projections(cameras: &Cameras) -> Tensor<3> {
         let rows = [fx, &zero, cx, &zero, &zero, fy, cy, &zero, &zero, &zero, &one, &zero, &zero, &zero, &zero, &one];
         Tensor::cat(rows.map(Tensor::clone).into(), 3).reshape([batch, views, 4, 4])
     };
-    let forward = matrix([&fx, &cx, &fy, &cy]).matmul(world_to_camera(&cameras.c2w));
+    let forward = matmul_without_gradient(matrix([&fx, &cx, &fy, &cy]), world_to_camera(&cameras.c2w));
     let inverse = matrix([&fx.clone().recip(), &-(cx / fx), &fy.clone().recip(), &-(cy / fy)]);
-    let backward = cameras.c2w.clone().matmul(inverse);
+    let backward = matmul_without_gradient(cameras.c2w.clone(), inverse);
     let flat = |matrix: Tensor<4>| matrix.reshape([batch, views, 16]);
     Tensor::cat(vec![flat(forward), flat(backward)], 2)
 }
@@ -130,7 +131,7 @@ pub(crate) fn upload_ids(ids: &[u32], device: &Device) -> Tensor<1, Int> {
 /// Inverts rigid poses, `[B, V, 4, 4]`.
 fn world_to_camera(c2w: &Tensor<4>) -> Tensor<4> {
     let rotation = c2w.clone().narrow(2, 0, 3).narrow(3, 0, 3).swap_dims(2, 3);
-    let shift = -rotation.clone().matmul(c2w.clone().narrow(2, 0, 3).narrow(3, 3, 1));
+    let shift = -matmul_without_gradient(rotation.clone(), c2w.clone().narrow(2, 0, 3).narrow(3, 3, 1));
     Tensor::cat(vec![Tensor::cat(vec![rotation, shift], 3), c2w.clone().narrow(2, 3, 1)], 2)
 }
 

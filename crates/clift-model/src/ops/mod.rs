@@ -10,8 +10,11 @@
 //! - `attention`: softmax attention
 //! - `cluster_attention`: attention inside clusters
 //! - `head_transform`: heads in the frame of a token's camera, for camera-relative attention
+//! - `convolution`: convolutions with constant weights, of the perceptual loss and LPIPS
 //!
-//! Without a backward: `optimizer`, updates of parameters.
+//! Without a backward:
+//! - `matmul`: products
+//! - `optimizer`: updates of parameters
 //!
 //! Backends:
 //! - `kernels`: the trait
@@ -30,10 +33,12 @@ pub(crate) mod autodiff;
 pub(crate) mod backends;
 pub(crate) mod cluster_attention;
 pub(crate) mod composed;
+pub(crate) mod convolution;
 pub(crate) mod head_transform;
 pub(crate) mod kernels;
 pub(crate) mod linear;
 pub(crate) mod mac_counter;
+pub(crate) mod matmul;
 pub(crate) mod optimizer;
 pub(crate) mod precision;
 pub(crate) mod rms_norm;

@@ -16,6 +16,8 @@ pub struct AdamWFactors {
     pub epsilon: f32,
     /// Number of the update, counted from 1.
     pub time: usize,
+    /// Factor of the gradient.
+    pub grad_factor: f32,
 }
 
 /// Returns a parameter and the means of its gradients and of their squares after an update by a gradient; `None` on devices
@@ -30,7 +32,7 @@ pub fn fused_adamw<const D: usize>(
     let grad = cube_tensor(grad)?;
     let [parameter, mean, square] = tensors.map(cube_tensor);
     let (client, shape) = (grad.client.clone(), grad.meta.shape().clone());
-    let AdamWFactors { learning_rate, weight_decay, betas: [beta_1, beta_2], epsilon, time } = factors;
+    let AdamWFactors { learning_rate, weight_decay, betas: [beta_1, beta_2], epsilon, time, grad_factor } = factors;
     let correction = |beta: f32| 1.0 - beta.powi(time as i32);
     let settings = clift_cube::AdamW {
         learning_rate: learning_rate as f32,
@@ -40,6 +42,7 @@ pub fn fused_adamw<const D: usize>(
         correction_1: correction(beta_1),
         correction_2: correction(beta_2),
         epsilon,
+        grad_factor,
     };
     let inputs = [parameter?, mean?, square?].map(buffer);
     let outputs = clift_cube::adamw(&client, settings, inputs.each_ref(), &buffer(grad.clone()));

@@ -6,6 +6,7 @@ use burn::tensor::{Int, Tensor, assert_shape};
 use serde::{Deserialize, Serialize};
 use strum::Display;
 
+use crate::ops::matmul::matmul_without_gradient;
 use crate::views::upload::Cameras;
 
 /// Frame of the rays that are inputs of the networks.
@@ -53,7 +54,8 @@ pub fn plucker(cameras: &Cameras) -> Tensor<5> {
     let camera_ray = camera_rays(cameras).reshape([batch, views, height * width, 3]);
 
     let rotation = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 0..3]);
-    let direction = camera_ray.matmul(rotation.swap_dims(2, 3)).reshape([batch, views, height, width, 3]);
+    let direction = matmul_without_gradient(camera_ray, rotation.swap_dims(2, 3));
+    let direction = direction.reshape([batch, views, height, width, 3]);
     let origin = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 3..4]);
     let origin = origin.reshape([batch, views, 1, 1, 3]).expand([batch, views, height, width, 3]);
     Tensor::cat(vec![cross(origin, direction.clone()), direction], 4)

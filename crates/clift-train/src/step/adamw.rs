@@ -5,6 +5,7 @@ use burn::tensor::{Device, Tensor};
 use clift_model::{AdamWFactors, fused_adamw};
 
 use crate::config::config::OptimizerConfig;
+use crate::step::optimizer::GradientFactor;
 
 /// The released code's epsilon.
 const EPSILON: f32 = 1e-8;
@@ -15,13 +16,14 @@ pub struct AdamW {
     plain: burn::optim::AdamW,
     betas: [f32; 2],
     weight_decay: f32,
+    factor: GradientFactor,
 }
 
 impl AdamW {
-    pub fn new(config: &OptimizerConfig) -> Self {
+    pub fn new(config: &OptimizerConfig, factor: GradientFactor) -> Self {
         let (betas, weight_decay) = (config.betas.map(|beta| beta as f32), config.weight_decay as f32);
         let plain = AdamWConfig::new().with_beta_1(betas[0]).with_beta_2(betas[1]).with_epsilon(EPSILON);
-        Self { plain: plain.with_weight_decay(weight_decay).build(), betas, weight_decay }
+        Self { plain: plain.with_weight_decay(weight_decay).build(), betas, weight_decay, factor }
     }
 }
 
@@ -36,15 +38,15 @@ impl Optimizer for AdamW {
         state: Option<AdamWState<D>>,
     ) -> (Tensor<D>, Option<AdamWState<D>>) {
         if let Some(AdamWState { momentum }) = &state {
-            let Self { betas, weight_decay, .. } = *self;
+            let (betas, weight_decay, grad_factor) = (self.betas, self.weight_decay, self.factor.get() as f32);
             let time = momentum.time + 1;
-            let factors = AdamWFactors { learning_rate, weight_decay, betas, epsilon: EPSILON, time };
+            let factors = AdamWFactors { learning_rate, weight_decay, betas, epsilon: EPSILON, time, grad_factor };
             let tensors = [&tensor, &momentum.moment_1, &momentum.moment_2];
             if let Some([tensor, mean, square]) = fused_adamw(tensors, &grad, factors) {
                 return (tensor, Some(AdamWState::new(AdaptiveMomentumState::new(time, mean, square))));
             }
         }
-        self.plain.step(learning_rate, tensor, grad, state)
+        self.plain.step(learning_rate, tensor, self.factor.scale(grad), state)
     }
 
     fn to_device<const D: usize>(state: AdamWState<D>, device: &Device) -> AdamWState<D> {

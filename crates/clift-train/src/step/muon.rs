@@ -2,8 +2,9 @@
 //!
 //! Burn updates one parameter after the other, and the products of one small matrix are too small for several threads. Here
 //! an update is two passes over the parameters. The first collects the gradients with momentum. Threads then orthogonalize
-//! one matrix each. The second pass applies the results.
+//! one matrix each, or a GPU all of a shape. The second pass applies the results.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use burn::module::{Module, ModuleVisitor, Param, ParamGroup, ParamId};
@@ -11,7 +12,10 @@ use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::momentum::{Momentum, MomentumConfig};
 use burn::optim::{GradientsParams, LearningRate, ModuleOptimizer, MuonState, Optimizer};
 use burn::tensor::{Device, Tensor};
+use clift_model::matmul_without_gradient;
 use rayon::prelude::*;
+
+use crate::step::optimizer::GradientFactor;
 
 /// Coefficients of a Newton-Schulz step: `X <- (a + b X X^T + c (X X^T)^2) X`.
 const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
@@ -22,14 +26,15 @@ const NEWTON_SCHULZ_STEPS: usize = 5;
 pub struct Muon {
     momentum: Momentum,
     weight_decay: f64,
+    factor: GradientFactor,
     /// Gradients with momentum, while a pass collects them.
     collected: Arc<Mutex<Option<Vec<Tensor<2>>>>>,
 }
 
 impl Muon {
-    pub fn new(weight_decay: f64) -> Self {
+    pub fn new(weight_decay: f64, factor: GradientFactor) -> Self {
         let momentum = Momentum::new(&MomentumConfig { momentum: 0.95, dampening: 0.0, nesterov: true });
-        Self { momentum, weight_decay, collected: Arc::default() }
+        Self { momentum, weight_decay, factor, collected: Arc::default() }
     }
 
     fn collected(&self) -> std::sync::MutexGuard<'_, Option<Vec<Tensor<2>>>> {
@@ -50,13 +55,7 @@ impl Muon {
         let model = optimizer.step(rate.clone(), model, of_group);
         let collected = self.collected().take().unwrap_or_default();
         assert_eq!(collected.len(), ids.len(), "the optimizer updates every parameter of the group");
-        let on_host = collected.iter().all(|grad| grad.device() == Device::flex());
-        let updates: Vec<Tensor<2>> = if on_host {
-            collected.into_par_iter().map(orthogonalized).collect()
-        } else {
-            collected.into_iter().map(orthogonalized).collect()
-        };
-        for (id, update) in ids.into_iter().zip(updates) {
+        for (id, update) in ids.into_iter().zip(orthogonalized(collected)) {
             grads.register(id, update);
         }
         optimizer.step(rate, model, grads)
@@ -112,7 +111,7 @@ impl Optimizer for Muon {
         assert_eq!(D, 2, "Muon updates matrices");
         let [rows, columns] = [tensor.dims()[0], tensor.dims()[1]];
         if let Some(collected) = self.collected().as_mut() {
-            let (grad, momentum) = self.momentum.transform(grad, state.map(|state| state.momentum));
+            let (grad, momentum) = self.momentum.transform(self.factor.scale(grad), state.map(|state| state.momentum));
             collected.push(grad.reshape([rows, columns]));
             return (tensor, Some(MuonState::new(momentum)));
         }
@@ -127,19 +126,38 @@ impl Optimizer for Muon {
     }
 }
 
-/// Moves the singular values of a matrix close to one, by Newton-Schulz steps.
-fn orthogonalized(matrix: Tensor<2>) -> Tensor<2> {
-    let [rows, columns] = matrix.dims();
+/// Moves the singular values of matrices close to one: on the host every matrix by a thread, elsewhere equal shapes together.
+fn orthogonalized(matrices: Vec<Tensor<2>>) -> Vec<Tensor<2>> {
+    if matrices.iter().all(|matrix| matrix.device() == Device::flex()) {
+        let one = |matrix: Tensor<2>| newton_schulz(matrix.unsqueeze()).squeeze_dim(0);
+        return matrices.into_par_iter().map(one).collect();
+    }
+    let mut groups = BTreeMap::<[usize; 2], Vec<(usize, Tensor<2>)>>::new();
+    for (i, matrix) in matrices.into_iter().enumerate() {
+        groups.entry(matrix.dims()).or_default().push((i, matrix));
+    }
+    let mut results = BTreeMap::new();
+    for group in groups.into_values() {
+        let (numbers, matrices): (Vec<_>, Vec<_>) = group.into_iter().unzip();
+        let matrices = newton_schulz(Tensor::stack(matrices, 0)).chunk(numbers.len(), 0);
+        results.extend(numbers.into_iter().zip(matrices.into_iter().map(|matrix| matrix.squeeze_dim(0))));
+    }
+    results.into_values().collect()
+}
+
+/// Moves the singular values of matrices `[count, rows, columns]` close to one, by Newton-Schulz steps.
+fn newton_schulz(matrices: Tensor<3>) -> Tensor<3> {
+    let [count, rows, columns] = matrices.dims();
     let is_tall = rows > columns;
-    let x = if is_tall { matrix.transpose() } else { matrix };
-    let norm = x.clone().square().sum().sqrt().clamp_min(1e-7);
-    let mut x = x.div(norm.unsqueeze());
+    let norm = matrices.clone().square().reshape([count, rows * columns]).sum_dim(1).sqrt().clamp_min(1e-7);
+    let x = matrices.div(norm.reshape([count, 1, 1]));
+    let mut x = if is_tall { x.swap_dims(1, 2) } else { x };
     let [a, b, c] = COEFFICIENTS;
     for _ in 0..NEWTON_SCHULZ_STEPS {
-        let gram = x.clone().matmul(x.clone().transpose());
-        let squared = gram.clone().matmul(gram.clone());
+        let gram = matmul_without_gradient(x.clone(), x.clone().swap_dims(1, 2));
+        let squared = matmul_without_gradient(gram.clone(), gram.clone());
         let factor = gram.mul_scalar(b).add(squared.mul_scalar(c));
-        x = x.clone().mul_scalar(a).add(factor.matmul(x));
+        x = x.clone().mul_scalar(a).add(matmul_without_gradient(factor, x));
     }
-    if is_tall { x.transpose() } else { x }
+    if is_tall { x.swap_dims(1, 2) } else { x }
 }

@@ -15,7 +15,7 @@ use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::gradient_sum::GradientSum;
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
-use crate::step::optimizer::{StageOptimizer, clip_factor, norm_on_device, scale_gradients};
+use crate::step::optimizer::{StageOptimizer, clip_factor, norm_on_device};
 
 /// A model with its optimizer on an autodiff device.
 pub struct TrainState {
@@ -131,8 +131,7 @@ impl TrainState {
         update.grad_norm /= factor;
         update.applied = accept(update.loss, update.grad_norm);
         let model = if update.applied {
-            let grads = scale_gradients(&model, grads, clip_factor(update.grad_norm, max_grad_norm) / factor);
-            optimizer.step(rate, model, grads)
+            optimizer.step(rate, model, grads, clip_factor(update.grad_norm, max_grad_norm) / factor)
         } else {
             model
         };

@@ -5,7 +5,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use clift_model::Network;
 use clift_train::{
-    DeviceBatch, Loss, OptimizerConfig, Stage, StageBatch, StageOptimizer, TrainError, clip_global_norm, freeze,
+    DeviceBatch, Loss, OptimizerConfig, Stage, StageBatch, StageOptimizer, TrainError, clip_factor, freeze,
     global_norm, render_loss, seeded_batch, seeded_model,
 };
 
@@ -47,8 +47,7 @@ fn losses(mut model: Network, batch: &StageBatch, device: &Device, in_f64: bool)
         losses.push(values(loss.clone().inner())[0]);
         let grads = GradientsParams::from_grads(loss.backward(), &model);
         let norm = global_norm(&model, &grads);
-        let grads = clip_global_norm(&model, grads, norm, config.max_grad_norm);
-        model = optimizer.step(10.0 * config.learning_rate, model, grads);
+        model = optimizer.step(10.0 * config.learning_rate, model, grads, clip_factor(norm, config.max_grad_norm));
     }
     Ok(losses)
 }

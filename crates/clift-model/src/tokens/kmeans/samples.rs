@@ -3,6 +3,7 @@
 use burn::tensor::{DType, Device, IndexingUpdateOp, Int, Tensor, TensorData, Transaction};
 use rayon::prelude::*;
 
+use crate::ops::matmul::matmul_without_gradient;
 use crate::tokens::kmeans::labels::Labels;
 
 /// Distances per matrix product for the table on the host: 4 MiB in f32, which fit into a cache.
@@ -50,7 +51,7 @@ impl Samples {
         let (count, rows) = (self.len(), (BLOCK_LEN / self.len()).max(1));
         let mut distances = vec![0.0; ids.len() * count];
         for (ids, distances) in ids.chunks(rows).zip(distances.chunks_mut(rows * count)) {
-            let products = self.select(ids).matmul(self.tokens.clone().transpose());
+            let products = matmul_without_gradient(self.select(ids), self.tokens.clone().transpose());
             let products = products.cast(DType::F32).into_data();
             let products = products.as_slice::<f32>().expect("cast to f32");
             let lines = distances.par_chunks_mut(count).zip(products.par_chunks(count)).zip(ids);
@@ -69,7 +70,7 @@ impl Samples {
     pub fn assign(&self, means: Tensor<2>) -> Labels {
         let squares = means.clone().square().sum_dim(1).transpose(); // [1, S]
         // The square of the token is equal for all means and added on the host.
-        let scores = self.tokens.clone().matmul(means.mul_scalar(-2.0).transpose()) + squares; // [N, S]
+        let scores = matmul_without_gradient(self.tokens.clone(), means.mul_scalar(-2.0).transpose()) + squares; // [N, S]
         let (score, cluster) = scores.min_dim_with_indices(1);
         let mut read = Transaction::default().register(score).register(cluster).execute().into_iter();
         let mut next = || read.next().expect("two were registered");
