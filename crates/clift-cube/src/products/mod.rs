@@ -1,6 +1,7 @@
 //! Products, on `register_product` (f32) or `matrix_product` (cooperative matrices, f16), with an `epilogue`; `tiles` is the
-//! table of their tiles.
+//! table of their tiles. `convolution` is a product with the neighbours of every pixel.
 
+pub(crate) mod convolution;
 pub(crate) mod epilogue;
 pub(crate) mod matrix_product;
 pub(crate) mod product;

@@ -136,6 +136,11 @@ mod tests {
                 check_fixture(&narrow(options), &fixture, options, [tolerance * 0.1, tolerance]);
             }
         }
+        // Without an adapter there is no such device.
+        if let Ok(device) = DeviceName::Wgpu.open() {
+            let options = (&device, DType::F32);
+            check_fixture(&narrow(options), &fixture, options, [1e-5, 1e-4]);
+        }
     }
 
     #[test]

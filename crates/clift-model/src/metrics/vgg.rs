@@ -11,6 +11,7 @@ use burn::tensor::{DType, Device, Tensor};
 
 use crate::error::ModelError;
 use crate::metrics::network_file::NetworkFile;
+use crate::ops::convolution::convolution;
 
 /// Number of stages. Pooling halves the image between stages.
 pub const NUM_STAGES: usize = 5;
@@ -138,7 +139,8 @@ impl Vgg {
                 x = self.shape.pooling.downsample(x); // [B, C, H, W] -> [B, C, H/2, W/2]
             }
             for (i, conv) in convs.iter().enumerate() {
-                x = relu(conv.forward(x));
+                let bias = conv.bias.as_ref().expect("every convolution has a bias");
+                x = relu(convolution(x, conv.weight.val(), bias.val()));
                 if i + 1 == self.shape.taps[stage] {
                     features.push(x.clone());
                 }

@@ -10,7 +10,9 @@ use crate::ops::composed::attention::{AttentionOutput, Qkv};
 use crate::ops::composed::cluster_attention::ClusterInputs;
 use crate::ops::composed::head_transform::Heads;
 use crate::ops::composed::norms::LayerNormInputs;
-use crate::ops::composed::{attention, cluster_attention, gelu, head_transform, linear, norms, primitives};
+use crate::ops::composed::{
+    attention, cluster_attention, convolution, gelu, head_transform, linear, norms, primitives,
+};
 use crate::ops::precision::Precision;
 
 /// The kernels of a backend. The default implementations run on every backend: compositions of Burn's operations, in the type
@@ -159,6 +161,20 @@ pub trait Kernels: Backend {
         is_gradient: bool,
     ) -> FloatTensor<Self> {
         head_transform::transform::<Self>(&x, &transforms, heads, is_gradient)
+    }
+
+    /// Convolves images `[B, I, H, W]` with zeros around them by `weight: [O, I, 3, 3]` and adds `bias: [O]`.
+    fn convolution(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
+        convolution::forward::<Self>(x, weight, bias)
+    }
+
+    /// Computes the gradient of `x` from `grad: [B, O, H, W]`.
+    fn convolution_backward(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        convolution::backward::<Self>(x, weight, grad)
     }
 }
 

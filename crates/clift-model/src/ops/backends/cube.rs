@@ -5,7 +5,7 @@ use burn::backend::{Cube, TensorMetadata};
 use burn::tensor::DType;
 use clift_cube as native;
 use clift_cube::{AttentionInputs, AttentionResults, AttentionSizes, Buffer, ClusterSizes, NormHeads, PartTransform};
-use clift_cube::{Product, Values};
+use clift_cube::{Matrices, Product, Values};
 use clift_kernels::HeadRows;
 
 use crate::ops::backends::cube_buffers::{MatrixBuffer, buffer, is_native, tensor};
@@ -13,7 +13,9 @@ use crate::ops::composed::attention::{AttentionOutput, Qkv};
 use crate::ops::composed::cluster_attention::ClusterInputs;
 use crate::ops::composed::head_transform::Heads;
 use crate::ops::composed::norms::{EPSILON, LayerNormInputs};
-use crate::ops::composed::{attention, cluster_attention, gelu, head_transform, linear, norms, primitives};
+use crate::ops::composed::{
+    attention, cluster_attention, convolution, gelu, head_transform, linear, norms, primitives,
+};
 use crate::ops::kernels::{HeadConfig, Kernels, matmul_in};
 use crate::ops::precision::Precision;
 
@@ -218,6 +220,49 @@ impl Kernels for Cube {
         let output = native::transform_heads(&x.client, &parts, sizes, &buffer(transforms), &buffer(x.clone()));
         tensor(&x, output, x.shape())
     }
+
+    fn convolution(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
+        if ![&x, &weight, &bias].into_iter().all(is_native) {
+            return convolution::forward::<Self>(x, weight, bias);
+        }
+        convolve(x, primitives::permute::<Self>(weight, [2, 3, 1, 0]), Some(bias))
+    }
+
+    fn convolution_backward(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        if ![&weight, &grad].into_iter().all(is_native) {
+            return convolution::backward::<Self>(x, weight, grad);
+        }
+        // The convolution of the gradient by the weights of the opposite neighbours.
+        convolve(grad, convolution::weight_of_gradient::<Self>(weight), None)
+    }
+}
+
+/// Most values of the neighbours of all pixels that are kept at once.
+const MAX_NEIGHBOURS: usize = 1 << 28;
+
+/// Convolves images `[B, I, H, W]` by `weight: [3, 3, I, O]`, some images at a time. The values of a pixel lie side by side in
+/// the result.
+fn convolve(x: FloatTensor<Cube>, weight: FloatTensor<Cube>, bias: Option<FloatTensor<Cube>>) -> FloatTensor<Cube> {
+    let [batch, inputs, height, width] = x.shape().dims();
+    let [_, _, _, outputs] = weight.shape().dims();
+    let (weight, bias) = (buffer(weight), bias.map(buffer));
+    let images = (MAX_NEIGHBOURS / (native::NEIGHBOURS * height * width * inputs)).clamp(1, batch);
+    let x = primitives::permute::<Cube>(x, [0, 2, 3, 1]);
+    let parts = (0..batch).step_by(images).map(|first| {
+        let count = images.min(batch - first);
+        let part = primitives::narrow::<Cube>(&x, 0, first..first + count);
+        let sizes = [count, height, width, inputs];
+        let weight = Matrices::contiguous(&weight, outputs);
+        let output = native::convolve(&part.client, &buffer(part.clone()), sizes, weight, outputs, bias.as_ref());
+        tensor(&part, output, [count, height, width, outputs])
+    });
+    let mut parts: Vec<_> = parts.collect();
+    let output = if parts.len() == 1 { parts.remove(0) } else { primitives::cat::<Cube>(parts) };
+    primitives::permute::<Cube>(output, [0, 3, 1, 2])
 }
 
 /// Returns the type of operands. Adapters do not have bf16.

@@ -8,9 +8,11 @@
 //! - `attention`: softmax attention in chunks of queries
 //! - `cluster_attention`: attention inside clusters
 //! - `head_transform`: transforms of heads by the cameras of tokens
+//! - `convolution`: convolutions by Burn
 
 pub(crate) mod attention;
 pub(crate) mod cluster_attention;
+pub(crate) mod convolution;
 pub(crate) mod gelu;
 pub(crate) mod head_transform;
 pub(crate) mod linear;

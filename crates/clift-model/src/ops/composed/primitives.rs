@@ -42,6 +42,18 @@ pub(crate) fn matmul<B: Backend>(lhs: FloatTensor<B>, rhs: FloatTensor<B>) -> Fl
     B::float_matmul(lhs, rhs)
 }
 
+/// Orders the dimensions as `dims` says.
+#[cfg(feature = "wgpu")]
+pub(crate) fn permute<B: Backend>(x: FloatTensor<B>, dims: [usize; 4]) -> FloatTensor<B> {
+    B::float_permute(x, &dims)
+}
+
+/// Joins tensors along their first dimension.
+#[cfg(feature = "wgpu")]
+pub(crate) fn cat<B: Backend>(parts: Vec<FloatTensor<B>>) -> FloatTensor<B> {
+    B::float_cat(parts, 0)
+}
+
 /// Returns the factor of the scores of attention, `1 / sqrt(head width)`.
 pub(crate) fn score_scale(dim: usize, num_heads: usize) -> f64 {
     1.0 / ((dim / num_heads) as f64).sqrt()

@@ -1,0 +1,104 @@
+//! Convolutions of 3 x 3 values with zeros around the image, as products.
+// B images, H rows, W columns, C channels
+
+use cubecl::prelude::*;
+
+use crate::buffers::buffer::{Buffer, Matrices, Values};
+use crate::buffers::elementwise::{UNITS, cube_count};
+use crate::products::product::Product;
+
+/// Values around a pixel.
+pub const NEIGHBOURS: usize = 9;
+
+/// Computes a convolution of images `[B, H, W, C]`: `[B, H, W, outputs]`. `weight` is a matrix `[9 C, outputs]` in the order
+/// row, column, channel. Allocates `9 B H W C` values.
+pub fn convolve(
+    client: &Client,
+    x: &Buffer,
+    [batch, height, width, channels]: [usize; 4],
+    weight: Matrices,
+    outputs: usize,
+    bias: Option<&Buffer>,
+) -> Buffer {
+    let (pixels, terms) = (height * width, NEIGHBOURS * channels);
+    let neighbours = Buffer::empty(client, batch * pixels * terms, Values::F32);
+    let vector = if channels.is_multiple_of(4) { 4 } else { 1 };
+    let units = neighbours.len / vector;
+    // SAFETY: the kernel compares its index with the length and pixels with the sizes.
+    unsafe {
+        gather_neighbours::launch_unchecked(
+            client,
+            cube_count(units.div_ceil(UNITS)),
+            CubeDim::new_1d(UNITS as u32),
+            vector,
+            x.arg(vector),
+            neighbours.arg(vector),
+            height,
+            width,
+            channels / vector,
+        );
+    }
+    let lhs = Matrices::contiguous(&neighbours, terms);
+    Product { bias, ..Product::new(lhs, weight, [batch * pixels, outputs, terms]) }.run(client)
+}
+
+/// Copies the neighbours of every pixel side by side, zeros outside the image. `channels` counts vectors.
+#[cube(launch_unchecked)]
+fn gather_neighbours<V: Size>(
+    x: &[Vector<f32, V>],
+    output: &mut [Vector<f32, V>],
+    height: usize,
+    width: usize,
+    channels: usize,
+) {
+    let index = ABSOLUTE_POS;
+    if index < output.len() {
+        let channel = index % channels;
+        let neighbour = index / channels % NEIGHBOURS;
+        let pixel = index / (channels * NEIGHBOURS);
+        // One more than the position, to stay positive.
+        let row = pixel / width % height + neighbour / 3;
+        let column = pixel % width + neighbour % 3;
+        let mut values = Vector::<f32, V>::new(0.0);
+        if row > 0 && row <= height && column > 0 && column <= width {
+            let image = pixel / (height * width);
+            values = x[((image * height + row - 1) * width + column - 1) * channels + channel];
+        }
+        output[index] = values;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{client, random, read, upload, worst};
+
+    #[test]
+    fn convolutions_equal_f64() {
+        let Some(client) = client() else { return };
+        for [batch, height, width, channels, outputs] in [[1, 1, 1, 3, 5], [2, 5, 7, 3, 8], [1, 6, 4, 8, 70]] {
+            let x = random(batch * height * width * channels, 1);
+            let weight = random(NEIGHBOURS * channels * outputs, 2);
+            let bias = random(outputs, 3);
+            let mut expected = Vec::new();
+            for (image, row, column, output) in (0..batch * height * width * outputs).map(|i| {
+                let pixel = i / outputs;
+                (pixel / (height * width), pixel / width % height, pixel % width, i % outputs)
+            }) {
+                let mut sum = f64::from(bias[output]);
+                for (n, channel) in (0..NEIGHBOURS).flat_map(|n| (0..channels).map(move |channel| (n, channel))) {
+                    let (row, column) = ((row + n / 3).wrapping_sub(1), (column + n % 3).wrapping_sub(1));
+                    if row < height && column < width {
+                        let value = x[((image * height + row) * width + column) * channels + channel];
+                        sum += f64::from(value) * f64::from(weight[(n * channels + channel) * outputs + output]);
+                    }
+                }
+                expected.push(sum);
+            }
+            let [x, weight, bias] = [&x, &weight, &bias].map(|x| upload(&client, x, Values::F32));
+            let weight = Matrices::contiguous(&weight, outputs);
+            let output = convolve(&client, &x, [batch, height, width, channels], weight, outputs, Some(&bias));
+            assert!(worst(&read(&client, &output), &expected) < 1e-5);
+        }
+    }
+}
