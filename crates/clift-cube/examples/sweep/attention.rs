@@ -82,15 +82,15 @@ impl Attention {
             attention_backward_tile(client, self.sizes, &inputs, results, &to, tile, gradients);
             vec![grads[usize::from(gradients == AttentionGradients::KeysAndValues)].clone()]
         };
-        // Products of scores that a direction computes, and its stages in shared memory.
-        let (kernel, products, stages) = match direction {
-            Direction::Forward => ("attention forward", 2, [1, 1]),
-            Direction::ByQueries => ("attention backward by queries", 3, [2, 1]),
-            Direction::ByKeys => ("attention backward by keys", 4, [2, 2]),
+        // Products of scores that a direction computes.
+        let (kernel, products) = match direction {
+            Direction::Forward => ("attention forward", 2),
+            Direction::ByQueries => ("attention backward by queries", 3),
+            Direction::ByKeys => ("attention backward by keys", 4),
         };
         let work = Work::Flops(2.0 * (products * batch * num_queries * num_keys * self.dim()) as f64);
         let shared_bytes = client.properties().hardware.max_shared_memory_size;
-        let fits = |tile: &AttentionTile| tile.shared_bytes(stages) <= shared_bytes;
+        let fits = |tile: &AttentionTile| tile.shared_bytes() <= shared_bytes;
         for &tile in tiles.iter().filter(|tile| tile.as_ref().is_none_or(fits)) {
             let launch = || match direction {
                 Direction::Forward => self.forward(client, tile).into(),

@@ -11,8 +11,8 @@ use half::f16;
 
 use crate::attention::head_rows::{Rows, head_of_cube, read_rows};
 use crate::attention::matrix_scores::{
-    AttentionTile, Scores, Stage, add_products, column_of_unit, load_rows, mask, max_of_plane, max_of_row, row_of_unit,
-    scale_sums, stage_block, stage_transposed, sum_of_row, write_scores, write_sums, zero_sums,
+    AttentionTile, Scores, Stage, add_products, column_of_unit, fetch_block, load_rows, mask, max_of_row, put_block,
+    row_of_unit, scale_sums, sum_of_row, write_scores, write_sums, zero_sums,
 };
 use crate::buffers::load::Four;
 
@@ -38,8 +38,8 @@ pub(crate) fn forward<F: Float, V: Size>(
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
-    let mut stage = Stage::new_slice(comptime!(tile.stage_lens()[0]));
-    let mut transposed = Stage::new_slice(comptime!(tile.stage_lens()[1]));
+    let mut keys = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut values = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
     let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
     let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
     let row = row_of_unit(tile);
@@ -47,36 +47,41 @@ pub(crate) fn forward<F: Float, V: Size>(
     let weight_row = row * comptime!(tile.pitches()[1]);
     let fours = comptime!(tile.fours());
 
-    let mut partial = Shared::<[f32]>::new_slice(comptime!(tile.units()));
-    let queries = load_rows::<F, V>(&mut stage, query, &query_rows, &head, first_row, tile);
+    let queries = load_rows::<F, V>(&mut keys, query, &query_rows, &head, first_row, tile);
     let mut sums = zero_sums(comptime!(tile.matrices()[1]), tile);
-    let mut values = Array::<Four<f32>>::new(fours);
+    let mut scaled = Array::<Four<f32>>::new(fours);
     let mut maximum = f32::new(f32::MIN);
     // Of the unit's columns.
     let mut total = Four::<f32>::new(0.0);
 
+    let mut next_keys = Array::<Four<f16>>::new(comptime!(tile.fetches()));
+    let mut next_values = Array::<Four<f16>>::new(comptime!(tile.fetches()));
+    fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, 0usize, tile);
     let mut first = 0usize;
     while first < key_rows.count {
         sync_cube();
-        stage_block::<F, V>(&mut stage, key, &key_rows, &head, first, tile);
-        stage_transposed::<F, V>(&mut transposed, value, &value_rows, &head, first, tile);
+        put_block(&mut keys, &next_keys, tile);
+        put_block(&mut values, &next_values, tile);
         sync_cube();
-        write_scores(&mut scores, &queries, &stage, tile);
+        fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, first + tile.columns, tile);
+        write_scores(&mut scores, &queries, &keys, tile);
         let mut largest = f32::new(f32::MIN);
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            values[i] = scores[(score_row + column) / 4] * Four::<f32>::new(scale);
+            scaled[i] = scores[(score_row + column) / 4] * Four::<f32>::new(scale);
             #[unroll]
             for j in 0..4usize {
                 if first + column + j < key_rows.count {
-                    largest = max(largest, values[i].extract(j));
+                    largest = max(largest, scaled[i].extract(j));
                 }
             }
         }
         // Of all units of the row.
-        largest = max_of_row(&mut partial, largest, tile);
-        if max_of_plane(&mut partial, largest - maximum, tile) > LEEWAY {
+        largest = max_of_row(largest, tile);
+        if plane_any(largest - maximum > LEEWAY) {
             let raised = max(maximum, largest);
             let decay = (maximum - raised).exp();
             maximum = raised;
@@ -86,12 +91,12 @@ pub(crate) fn forward<F: Float, V: Size>(
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            let weight = mask((values[i] - Four::<f32>::new(maximum)).exp(), first + column, key_rows.count);
+            let weight = mask((scaled[i] - Four::<f32>::new(maximum)).exp(), first + column, key_rows.count);
             total += weight;
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(weight);
         }
         sync_plane();
-        add_products(&sums, &weights, &transposed, tile);
+        add_products(&sums, &weights, &values, tile);
         first += tile.columns;
     }
 
@@ -100,7 +105,7 @@ pub(crate) fn forward<F: Float, V: Size>(
     for j in 0..4usize {
         sum += total.extract(j);
     }
-    sum = sum_of_row(&mut partial, sum, tile);
+    sum = sum_of_row(sum, tile);
     write_sums::<V>(output, &sums, &mut scores, 1.0 / sum, &output_rows, &head, first_row, tile);
     if UNIT_POS as usize % comptime!(tile.lanes()) == 0 && first_row + row < query_rows.count {
         log_sum[CUBE_POS_Y as usize * query_rows.count + first_row + row] = maximum + sum.ln();
@@ -129,9 +134,8 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
-    let mut keys = Stage::new_slice(comptime!(tile.stage_lens()[0]));
-    let mut values = Stage::new_slice(comptime!(tile.stage_lens()[0]));
-    let mut transposed_keys = Stage::new_slice(comptime!(tile.stage_lens()[1]));
+    let mut keys = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut values = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
     let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
     let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
     let row = row_of_unit(tile);
@@ -147,13 +151,18 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
     let log = Four::<f32>::new(log_sum[index]);
     let delta = Four::<f32>::new(delta[index]);
 
+    let mut next_keys = Array::<Four<f16>>::new(comptime!(tile.fetches()));
+    let mut next_values = Array::<Four<f16>>::new(comptime!(tile.fetches()));
+    fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, 0usize, tile);
     let mut first = 0usize;
     while first < key_rows.count {
         sync_cube();
-        stage_block::<F, V>(&mut keys, key, &key_rows, &head, first, tile);
-        stage_transposed::<F, V>(&mut transposed_keys, key, &key_rows, &head, first, tile);
-        stage_block::<F, V>(&mut values, value, &value_rows, &head, first, tile);
+        put_block(&mut keys, &next_keys, tile);
+        put_block(&mut values, &next_values, tile);
         sync_cube();
+        fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, first + tile.columns, tile);
         write_scores(&mut scores, &queries, &keys, tile);
         #[unroll]
         for i in 0..fours {
@@ -168,7 +177,7 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(mask(slope, first + column, key_rows.count));
         }
         sync_plane();
-        add_products(&sums, &weights, &transposed_keys, tile);
+        add_products(&sums, &weights, &keys, tile);
         first += tile.columns;
     }
     write_sums::<V>(grad_query, &sums, &mut scores, scale, &grad_rows, &head, first_row, tile);
@@ -197,10 +206,8 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
 ) {
     let head = head_of_cube(num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
-    let mut queries = Stage::new_slice(comptime!(tile.stage_lens()[0]));
-    let mut grads = Stage::new_slice(comptime!(tile.stage_lens()[0]));
-    let mut transposed_queries = Stage::new_slice(comptime!(tile.stage_lens()[1]));
-    let mut transposed_grads = Stage::new_slice(comptime!(tile.stage_lens()[1]));
+    let mut queries = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
+    let mut grads = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
     let mut weights = Stage::new_slice(comptime!(tile.rows() * tile.pitches()[1] / 4));
     let mut scores = Scores::new_slice(comptime!(tile.rows() * tile.pitches()[2] / 4));
     let row = row_of_unit(tile);
@@ -215,14 +222,18 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
     let mut softmax = Array::<Four<f32>>::new(fours);
     let start = CUBE_POS_Y as usize * query_rows.count;
 
+    let mut next_queries = Array::<Four<f16>>::new(comptime!(tile.fetches()));
+    let mut next_grads = Array::<Four<f16>>::new(comptime!(tile.fetches()));
+    fetch_block::<F, V>(&mut next_queries, query, &query_rows, &head, 0usize, tile);
+    fetch_block::<G, V>(&mut next_grads, grad_output, &output_rows, &head, 0usize, tile);
     let mut first = 0usize;
     while first < query_rows.count {
         sync_cube();
-        stage_block::<F, V>(&mut queries, query, &query_rows, &head, first, tile);
-        stage_block::<G, V>(&mut grads, grad_output, &output_rows, &head, first, tile);
-        stage_transposed::<F, V>(&mut transposed_queries, query, &query_rows, &head, first, tile);
-        stage_transposed::<G, V>(&mut transposed_grads, grad_output, &output_rows, &head, first, tile);
+        put_block(&mut queries, &next_queries, tile);
+        put_block(&mut grads, &next_grads, tile);
         sync_cube();
+        fetch_block::<F, V>(&mut next_queries, query, &query_rows, &head, first + tile.columns, tile);
+        fetch_block::<G, V>(&mut next_grads, grad_output, &output_rows, &head, first + tile.columns, tile);
         write_scores(&mut scores, &keys, &queries, tile);
         #[unroll]
         for i in 0..fours {
@@ -233,7 +244,7 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(softmax[i]);
         }
         sync_plane();
-        add_products(&value_sums, &weights, &transposed_grads, tile);
+        add_products(&value_sums, &weights, &grads, tile);
         write_scores(&mut scores, &values, &grads, tile);
         #[unroll]
         for i in 0..fours {
@@ -243,7 +254,7 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(slope);
         }
         sync_plane();
-        add_products(&key_sums, &weights, &transposed_queries, tile);
+        add_products(&key_sums, &weights, &queries, tile);
         first += tile.columns;
     }
     write_sums::<V>(grad_key_value, &key_sums, &mut scores, scale, &grad_key_rows, &head, first_row, tile);

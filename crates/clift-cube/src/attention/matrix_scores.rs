@@ -8,7 +8,7 @@ use half::f16;
 use crate::adapter::MatrixShape;
 use crate::attention::head_rows::{Head, Rows, write_values};
 use crate::buffers::load::{Four, load_four};
-use crate::products::matrix_product::{PAD, StagedMatrix, column_of_block, load_matrix};
+use crate::products::matrix_product::{PAD, StagedMatrix, load_matrix};
 
 /// Tile of a cube.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -47,30 +47,32 @@ impl AttentionTile {
         self.width.next_multiple_of(self.shape.sizes[1].max(self.shape.sizes[2]))
     }
 
-    /// Values between two lines of a stage, between rows of weights and lines of a transposed stage, and between rows of
-    /// scores.
+    /// Values between two lines of a stage, rows of weights, and rows of scores.
     pub(crate) fn pitches(self) -> [usize; 3] {
         [self.padded() + PAD, self.columns + PAD, self.columns + 4]
     }
 
-    /// Lines as the right operand of scores, weights, and a transposed stage as the right operand of sums.
+    /// Lines as the right operand of scores, weights, and lines as the right operand of sums, which is faster than a
+    /// transposed stage.
     pub(crate) fn staged(self) -> [StagedMatrix; 3] {
         let [lines, weights, _] = self.pitches();
-        let staged = |ident, pitch| StagedMatrix { ident, pitch, shape: self.shape };
-        [staged(MatrixIdent::B, lines), staged(MatrixIdent::A, weights), staged(MatrixIdent::B, weights)]
+        let staged = |ident, terms_inner, pitch| StagedMatrix { ident, terms_inner, pitch, shape: self.shape };
+        [
+            staged(MatrixIdent::B, true, lines),
+            staged(MatrixIdent::A, true, weights),
+            staged(MatrixIdent::B, false, lines),
+        ]
     }
 
-    /// Vectors of a stage and of a transposed stage.
-    pub(crate) fn stage_lens(self) -> [usize; 2] {
-        let [lines, weights, _] = self.pitches();
-        [self.columns * lines / 4, self.padded() * weights / 4]
+    /// Vectors of a block that a unit copies.
+    pub(crate) fn fetches(self) -> usize {
+        (self.columns * self.padded() / 4).div_ceil(self.units())
     }
 
-    /// Bytes of shared memory of a kernel with a number of stages and of transposed stages, weights and scores.
-    pub fn shared_bytes(self, [stages, transposed]: [usize; 2]) -> usize {
-        let ([len, transposed_len], [_, weights, scores]) = (self.stage_lens(), self.pitches());
-        let halves = 4 * (stages * len + transposed * transposed_len) + self.rows() * weights;
-        2 * halves + 4 * (self.rows() * scores + self.units())
+    /// Bytes of shared memory of a kernel: two stages and weights in f16, and scores.
+    pub fn shared_bytes(self) -> usize {
+        let [lines, weights, scores] = self.pitches();
+        2 * (2 * self.columns * lines + self.rows() * weights) + 4 * self.rows() * scores
     }
 
     /// Matrices of a row along its terms, and along its values.
@@ -82,10 +84,10 @@ impl AttentionTile {
 pub(crate) type Stage = Shared<[Four<f16>]>;
 pub(crate) type Scores = Shared<[Four<f32>]>;
 
-/// Copies a block of lines to shared memory.
+/// Reads a block of lines to registers, zeros after the last line.
 #[cube]
-pub(crate) fn stage_block<E: Numeric, V: Size>(
-    stage: &mut [Four<f16>],
+pub(crate) fn fetch_block<E: Numeric, V: Size>(
+    to: &mut Array<Four<f16>>,
     from: &[Vector<E, V>],
     lines: &Rows,
     head: &Head,
@@ -97,47 +99,26 @@ pub(crate) fn stage_block<E: Numeric, V: Size>(
     let units = comptime!(tile.units());
     let start = lines.start_of(head);
     #[unroll]
-    for step in 0..comptime!(groups.div_ceil(units)) {
+    for step in 0..comptime!(tile.fetches()) {
         let group = UNIT_POS as usize + step * units;
         if comptime!(groups.is_multiple_of(units)) || group < groups {
-            let line = group / fours;
-            let value = group % fours * 4;
-            stage[line * comptime!(tile.pitches()[0] / 4) + value / 4] =
-                load_four::<E, V, f16>(from, start, lines.stride, first + line, value, lines.count, tile.width);
+            let (line, value) = (first + group / fours, group % fours * 4);
+            to[step] = load_four::<E, V, f16>(from, start, lines.stride, line, value, lines.count, tile.width);
         }
     }
 }
 
-/// Copies a block of lines to shared memory, transposed: a line of the stage has a value of every line of the block.
+/// Writes a block that [`fetch_block`] read to shared memory.
 #[cube]
-pub(crate) fn stage_transposed<E: Numeric, V: Size>(
-    stage: &mut [Four<f16>],
-    from: &[Vector<E, V>],
-    lines: &Rows,
-    head: &Head,
-    first: usize,
-    #[comptime] tile: AttentionTile,
-) {
-    let fours = comptime!(tile.columns / 4);
-    let blocks = comptime!(tile.padded() / 4 * fours);
+pub(crate) fn put_block(stage: &mut [Four<f16>], from: &Array<Four<f16>>, #[comptime] tile: AttentionTile) {
+    let fours = comptime!(tile.padded() / 4);
+    let groups = comptime!(tile.columns * fours);
     let units = comptime!(tile.units());
-    let pitch = comptime!(tile.pitches()[1] / 4);
-    let start = lines.start_of(head);
     #[unroll]
-    for step in 0..comptime!(blocks.div_ceil(units)) {
-        let block = UNIT_POS as usize + step * units;
-        if comptime!(blocks.is_multiple_of(units)) || block < blocks {
-            let line = first + block % fours * 4;
-            let value = block / fours * 4;
-            let mut rows = Array::<Four<f16>>::new(4usize);
-            #[unroll]
-            for j in 0..4usize {
-                rows[j] = load_four::<E, V, f16>(from, start, lines.stride, line + j, value, lines.count, tile.width);
-            }
-            #[unroll]
-            for i in 0..4usize {
-                stage[(value + i) * pitch + block % fours] = column_of_block(rows[0], rows[1], rows[2], rows[3], i);
-            }
+    for step in 0..comptime!(tile.fetches()) {
+        let group = UNIT_POS as usize + step * units;
+        if comptime!(groups.is_multiple_of(units)) || group < groups {
+            stage[group / fours * comptime!(tile.pitches()[0] / 4) + group % fours] = from[step];
         }
     }
 }
@@ -159,10 +140,12 @@ pub(crate) fn load_rows<E: Numeric, V: Size>(
         matrices.push(Matrix::<f16>::from_value(MatrixIdent::A, m, n, k, MatrixLayout::RowMajor, f16::new(0.0)));
     }
     let row = first_row_of_plane(tile);
+    let mut block = Array::<Four<f16>>::new(comptime!(tile.fetches()));
     #[unroll]
     for pass in 0..comptime!(tile.rows().div_ceil(tile.columns)) {
         sync_cube();
-        stage_block::<E, V>(stage, from, lines, head, first + pass * tile.columns, tile);
+        fetch_block::<E, V>(&mut block, from, lines, head, first + pass * tile.columns, tile);
+        put_block(stage, &block, tile);
         sync_cube();
         if row / tile.columns == pass {
             #[unroll]
@@ -223,7 +206,7 @@ pub(crate) fn write_scores(
     sync_plane();
 }
 
-/// Adds the products of the plane's weights and the lines of a transposed stage.
+/// Adds the products of the plane's weights and the lines of a stage.
 #[cube]
 pub(crate) fn add_products(
     sums: &Sequence<Matrix<f32>>,
@@ -328,47 +311,24 @@ pub(crate) fn scale_sums(
     sync_plane();
 }
 
-/// Writes the unit's value to shared memory for the other units of its plane.
-#[cube]
-pub(crate) fn share(stage: &mut [f32], value: f32) {
-    sync_plane();
-    stage[UNIT_POS as usize] = value;
-    sync_plane();
-}
-
 /// Returns the maximum of the units of a row.
 #[cube]
-pub(crate) fn max_of_row(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) -> f32 {
-    share(stage, value);
+pub(crate) fn max_of_row(value: f32, #[comptime] tile: AttentionTile) -> f32 {
     let mut result = value;
     #[unroll]
-    for i in 0..comptime!(tile.lanes()) {
-        result = max(result, stage[row_of_unit(tile) * comptime!(tile.lanes()) + i]);
+    for bit in 0..comptime!(tile.lanes().ilog2()) {
+        result = max(result, plane_shuffle_xor(result, comptime!(1u32 << bit)));
     }
     result
 }
 
 /// Returns the sum of the units of a row.
 #[cube]
-pub(crate) fn sum_of_row(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) -> f32 {
-    share(stage, value);
-    let mut result = 0.0f32;
-    #[unroll]
-    for i in 0..comptime!(tile.lanes()) {
-        result += stage[row_of_unit(tile) * comptime!(tile.lanes()) + i];
-    }
-    result
-}
-
-/// Returns the maximum of the units of the plane.
-#[cube]
-pub(crate) fn max_of_plane(stage: &mut [f32], value: f32, #[comptime] tile: AttentionTile) -> f32 {
-    share(stage, value);
-    let plane = comptime!(tile.shape.plane);
-    let first = UNIT_POS as usize / plane * plane;
+pub(crate) fn sum_of_row(value: f32, #[comptime] tile: AttentionTile) -> f32 {
     let mut result = value;
-    for i in 0..plane {
-        result = max(result, stage[first + i]);
+    #[unroll]
+    for bit in 0..comptime!(tile.lanes().ilog2()) {
+        result += plane_shuffle_xor(result, comptime!(1u32 << bit));
     }
     result
 }

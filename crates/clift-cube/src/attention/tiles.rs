@@ -6,9 +6,6 @@ use crate::adapter::AdapterClass;
 use crate::attention::matrix_scores::AttentionTile;
 use crate::buffers::buffer::Values;
 
-/// Stages and transposed stages of the forward, and the most of the backward.
-const STAGES: [[usize; 2]; 2] = [[1, 1], [2, 2]];
-
 /// Returns the tiles of attention of an adapter, forward and backward, with operands of a type; `None` stands for register
 /// tiles.
 pub(crate) fn attention_tiles(client: &Client, operands: Values, width: usize) -> [Option<AttentionTile>; 2] {
@@ -20,7 +17,7 @@ pub(crate) fn attention_tiles(client: &Client, operands: Values, width: usize) -
     let (most_planes, columns) = if shape.sizes[0] == 16 { ([8, 4], 32) } else { ([4, 4], 16) };
     [0, 1].map(|i| {
         let tiles = [8, 4, 2, 1].map(|planes| AttentionTile { shape, planes, columns, width });
-        let fits = |tile: &AttentionTile| tile.planes <= most_planes[i] && tile.shared_bytes(STAGES[i]) <= shared_bytes;
+        let fits = |tile: &AttentionTile| tile.planes <= most_planes[i] && tile.shared_bytes() <= shared_bytes;
         tiles.into_iter().find(fits)
     })
 }

@@ -37,6 +37,12 @@ impl MatrixTile {
     pub(crate) fn num_planes(self) -> usize {
         self.planes[0] * self.planes[1]
     }
+
+    /// Bytes of shared memory of a cube: stages in f16, and a matrix of sums a plane.
+    pub(crate) fn shared_bytes(self) -> usize {
+        let ([m, n, k], [rows, columns, _]) = (self.stage, self.shape.sizes);
+        2 * self.buffers * (m + n) * (k + PAD) + 4 * self.num_planes() * rows * columns
+    }
 }
 
 /// An operand's part of a stage: lines of the terms of a row or a column.
@@ -135,7 +141,7 @@ fn put(stage: &mut [Four<f16>], from: &Array<Four<f16>>, first: usize, #[comptim
 
 /// Returns a column of four rows.
 #[cube]
-pub(crate) fn column_of_block(
+fn column_of_block(
     first: Four<f16>,
     second: Four<f16>,
     third: Four<f16>,
@@ -150,11 +156,12 @@ pub(crate) fn column_of_block(
     values
 }
 
-/// Operand of a product of matrices in a stage. The terms of a sum lie side by side: for other layouts NVIDIA's driver takes
-/// twice the time.
+/// Operand of a product of matrices in a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct StagedMatrix {
     pub(crate) ident: MatrixIdent,
+    /// A line has the terms of a sum. In products an H100 takes half the time then.
+    pub(crate) terms_inner: bool,
     /// Values between two lines.
     pub(crate) pitch: usize,
     pub(crate) shape: MatrixShape,
@@ -162,7 +169,8 @@ pub(crate) struct StagedMatrix {
 
 impl StagedMatrix {
     fn layout(self) -> MatrixLayout {
-        if self.ident == MatrixIdent::A { MatrixLayout::RowMajor } else { MatrixLayout::ColMajor }
+        let is_lhs = self.ident == MatrixIdent::A;
+        if is_lhs == self.terms_inner { MatrixLayout::RowMajor } else { MatrixLayout::ColMajor }
     }
 }
 
@@ -178,7 +186,7 @@ pub(crate) fn load_matrix(
     // SAFETY: the matrix is loaded below.
     let mut matrix =
         unsafe { Matrix::<f16>::uninitialized(comptime!(staged.ident), m, n, k, comptime!(staged.layout())) };
-    let first = side * staged.pitch + term;
+    let first = if comptime!(staged.terms_inner) { side * staged.pitch + term } else { term * staged.pitch + side };
     cmma::load(&mut matrix, &stage[first / 4..stage.len()], comptime!(staged.pitch as u32));
     matrix
 }
@@ -222,8 +230,10 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     let rhs_part = comptime!(StagePart { terms_inner: kind.rhs.terms_inner, sides: n, terms: k, units });
     let mut lhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(tile.buffers * lhs_part.len()));
     let mut rhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(tile.buffers * rhs_part.len()));
-    let lhs_staged = comptime!(StagedMatrix { ident: MatrixIdent::A, pitch: k + PAD, shape: tile.shape });
-    let rhs_staged = comptime!(StagedMatrix { ident: MatrixIdent::B, pitch: k + PAD, shape: tile.shape });
+    let lhs_staged =
+        comptime!(StagedMatrix { ident: MatrixIdent::A, terms_inner: true, pitch: k + PAD, shape: tile.shape });
+    let rhs_staged =
+        comptime!(StagedMatrix { ident: MatrixIdent::B, terms_inner: true, pitch: k + PAD, shape: tile.shape });
     let mut lhs_next = Array::<Four<f16>>::new(comptime!(lhs_part.fetches()));
     let mut rhs_next = Array::<Four<f16>>::new(comptime!(rhs_part.fetches()));
 

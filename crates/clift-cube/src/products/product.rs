@@ -4,14 +4,13 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::adapter::AdapterClass;
 use crate::buffers::buffer::{Buffer, Matrices, Values};
 use crate::buffers::load::{Four, LinesLaunch};
 use crate::products::epilogue::{Epilogue, write_four};
 use crate::products::matrix_product::matrix_product;
 use crate::products::product_kind::{OperandKind, ProductKind, SizesLaunch};
 use crate::products::register_product::register_product;
-use crate::products::tiles::ProductTile;
+use crate::products::tiles::{ProductTile, product_tile};
 
 /// Most tiles of an output whose long sums are split, so that all processors of the adapter have work: an H100 has 132, each
 /// with room for several tiles.
@@ -53,7 +52,8 @@ impl<'a> Product<'a> {
 
     /// Computes the product into a new buffer, with the adapter's tile of the table.
     pub fn run(&self, client: &Client) -> Buffer {
-        self.run_tile(client, AdapterClass::of(client).product_tile(self.operands, self.sizes))
+        let terms_inner = [!self.lhs.transposed, self.rhs.transposed];
+        self.run_tile(client, product_tile(client, self.operands, self.batch, self.sizes, terms_inner))
     }
 
     /// Computes the product with a tile, which decides the type of the operands.

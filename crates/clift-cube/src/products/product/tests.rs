@@ -97,7 +97,7 @@ fn matrix_tiles_equal_f64_of_rounded_operands() {
         check(&client, small, [24, 40, 64], 1, transposed, [Values::F16; 3]);
     }
     check(&client, small, [12, 70, 1030], 2, [true, false], [Values::F32; 3]);
-    let table = AdapterClass::of(&client).product_tile(Values::F16, [256, 256, 64]);
+    let table = product_tile(&client, Values::F16, 1, [256, 256, 64], [true, false]);
     check(&client, table, [96, 100, 72], 1, [false, true], [Values::F32, Values::F16, Values::F16]);
 }
 

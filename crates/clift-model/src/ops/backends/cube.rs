@@ -222,10 +222,10 @@ impl Kernels for Cube {
     }
 
     fn convolution(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
-        if ![&x, &weight, &bias].into_iter().all(is_native) {
-            return convolution::forward::<Self>(x, weight, bias);
+        match images_at_once(&x).filter(|_| is_native(&weight) && is_native(&bias)) {
+            Some(images) => convolve(&x, images, primitives::permute::<Self>(weight, [2, 3, 1, 0]), Some(bias)),
+            None => convolution::forward::<Self>(x, weight, bias),
         }
-        convolve(x, primitives::permute::<Self>(weight, [2, 3, 1, 0]), Some(bias))
     }
 
     fn convolution_backward(
@@ -233,25 +233,38 @@ impl Kernels for Cube {
         weight: FloatTensor<Self>,
         grad: FloatTensor<Self>,
     ) -> FloatTensor<Self> {
-        if ![&weight, &grad].into_iter().all(is_native) {
-            return convolution::backward::<Self>(x, weight, grad);
+        match images_at_once(&grad).filter(|_| is_native(&weight)) {
+            // The convolution of the gradient by the weights of the opposite neighbours.
+            Some(images) => convolve(&grad, images, convolution::weight_of_gradient::<Self>(weight), None),
+            None => convolution::backward::<Self>(x, weight, grad),
         }
-        // The convolution of the gradient by the weights of the opposite neighbours.
-        convolve(grad, convolution::weight_of_gradient::<Self>(weight), None)
     }
 }
 
-/// Most values of the neighbours of all pixels that are kept at once.
-const MAX_NEIGHBOURS: usize = 1 << 28;
+/// Most bytes of the neighbours of all pixels that are kept at once.
+const MAX_NEIGHBOURS: u64 = 1 << 30;
+
+/// Returns the number of images `[B, C, H, W]` whose pixels' neighbours are kept at once; `None` if the kernel does not accept
+/// them.
+fn images_at_once(x: &FloatTensor<Cube>) -> Option<usize> {
+    let limit = MAX_NEIGHBOURS.min(x.client.properties().memory.max_page_size);
+    let [batch, channels, height, width] = x.shape().dims();
+    let images = limit as usize / (4 * native::NEIGHBOURS * channels * height * width).max(1);
+    (is_native(x) && images > 0).then_some(images.min(batch))
+}
 
 /// Convolves images `[B, I, H, W]` by `weight: [3, 3, I, O]`, some images at a time. The values of a pixel lie side by side in
 /// the result.
-fn convolve(x: FloatTensor<Cube>, weight: FloatTensor<Cube>, bias: Option<FloatTensor<Cube>>) -> FloatTensor<Cube> {
+fn convolve(
+    x: &FloatTensor<Cube>,
+    images: usize,
+    weight: FloatTensor<Cube>,
+    bias: Option<FloatTensor<Cube>>,
+) -> FloatTensor<Cube> {
     let [batch, inputs, height, width] = x.shape().dims();
     let [_, _, _, outputs] = weight.shape().dims();
     let (weight, bias) = (buffer(weight), bias.map(buffer));
-    let images = (MAX_NEIGHBOURS / (native::NEIGHBOURS * height * width * inputs)).clamp(1, batch);
-    let x = primitives::permute::<Cube>(x, [0, 2, 3, 1]);
+    let x = primitives::permute::<Cube>(x.clone(), [0, 2, 3, 1]);
     let parts = (0..batch).step_by(images).map(|first| {
         let count = images.min(batch - first);
         let part = primitives::narrow::<Cube>(&x, 0, first..first + count);
