@@ -33,8 +33,8 @@ HERE = Path(__file__).resolve().parent
 PACKED = HERE.parent
 # Parts, and the share of the time at which each ends at the latest.
 PARTS = {"doctor": 0.12, "kernels": 0.5, "updates": 0.8, "train": 0.97}
-WORKS = ("stage1_step", "stage2_step", "encode", "render")
-REPEATS, WARM_UP = 8, 2
+# Repeats of every work. The first half warms up: a GPU raises its clocks only under load.
+WORKS = {"stage1_step": 10, "stage2_step": 14, "encode": 120, "render": 120}
 # A candidate that takes longer is stopped. The first update of a process compiles all kernels.
 CANDIDATE_S = 20.0
 # Failures in a row after which a compiler is given up: the device or the driver does not work.
@@ -216,7 +216,7 @@ class Sweep:
                         samples = self.measure_torch(work, precision, torch["device"], limit_s)
                     else:
                         samples = self.measure_clift(clifts[side], work, precision, limit_s)
-                    median = statistics.median(samples[WARM_UP:])
+                    median = statistics.median(samples[len(samples) // 2 :])
                     row |= {"first_s": samples[0], "median_s": median, "samples_s": samples}
                     self.say(f"{work}, {name}: {seconds(median)}, the first {seconds(samples[0])}")
                 except Failed as error:
@@ -227,12 +227,12 @@ class Sweep:
     def measure_torch(self, work: str, precision: str, device: str, limit_s: float) -> list[float]:
         variant = {"stage2_step": "exact sdpa"}.get(work, "sdpa")
         spec = dict(work=work, variant=variant, size=self.size, precision=precision, device=device)
-        return self.torch_process(spec | dict(repeats=REPEATS, warmup=0), limit_s)["samples_s"]
+        return self.torch_process(spec | dict(repeats=WORKS[work], warmup=0), limit_s)["samples_s"]
 
     def measure_clift(self, clift: Path, work: str, precision: str, limit_s: float) -> list[float]:
         path = self.folder / "clift.json"
         command = [clift, "bench", PACKED / "sizes.toml", "--case", work, "--no-error", "--stored-tokens", "1/4"]
-        command += ["--repeats", REPEATS, "--warmup", 0, "--json", path, "--force", "--device", self.args.device]
+        command += ["--repeats", WORKS[work], "--warmup", 0, "--json", path, "--force", "--device", self.args.device]
         run([*command, *sets(*overrides(self.size), f'precision="{precision}"')], limit_s)
         written = json.loads(path.read_text())
         if written["precision"] != precision or written["device"] != self.args.device:

@@ -18,7 +18,7 @@ max_chunks_mb=10
 # Builds what no variable names, and copies it without symbols.
 pack_binaries() {
     local folder=$1 root=$here/../.. target
-    local spirv=(-p clift -p clift-cube --features clift/wgpu,clift-cube/spirv)
+    local spirv=(-p clift -p clift-cube --features clift/vulkan,clift-cube/spirv)
     target=${CARGO_TARGET_DIR:-$root/target}/release
     build() { (cd "$root" && cargo build --locked --release "$@"); }
     [ -n "${CLIFT+set}" ] || build --features wgpu

@@ -1,14 +1,36 @@
 //! AdamW: Burn's, on GPUs by one kernel a parameter.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use burn::optim::{AdamWConfig, AdamWState, AdaptiveMomentumState, LearningRate, Optimizer};
 use burn::tensor::{Device, Tensor};
 use clift_model::{AdamWFactors, fused_adamw};
 
 use crate::config::config::OptimizerConfig;
-use crate::step::optimizer::GradientFactor;
 
 /// The released code's epsilon.
 const EPSILON: f32 = 1e-8;
+
+/// Factor of all gradients during an update, shared by the optimizers.
+#[derive(Clone, Default)]
+pub struct GradientFactor(Arc<AtomicU64>);
+
+impl GradientFactor {
+    pub fn set(&self, factor: f64) {
+        self.0.store(factor.to_bits(), Ordering::Relaxed);
+    }
+
+    pub fn get(&self) -> f64 {
+        f64::from_bits(self.0.load(Ordering::Relaxed))
+    }
+
+    /// Multiplies a gradient.
+    pub fn scale<const D: usize>(&self, grad: Tensor<D>) -> Tensor<D> {
+        let factor = self.get();
+        if factor == 1.0 { grad } else { grad.mul_scalar(factor) }
+    }
+}
 
 /// AdamW of a config.
 #[derive(Clone)]

@@ -15,7 +15,7 @@ use burn::tensor::{Device, Tensor};
 use clift_model::matmul_without_gradient;
 use rayon::prelude::*;
 
-use crate::step::optimizer::GradientFactor;
+use crate::step::adamw::GradientFactor;
 
 /// Coefficients of a Newton-Schulz step: `X <- (a + b X X^T + c (X X^T)^2) X`.
 const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];

@@ -1,8 +1,5 @@
 //! AdamW and Muon, global gradient norm and clipping.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-
 use burn::module::{Module, ModuleVisitor, Param, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{
@@ -13,7 +10,7 @@ use burn::tensor::{Device, Tensor};
 use clift_model::fused_gradient_norm;
 
 use crate::config::config::{Algorithm, OptimizerConfig};
-use crate::step::adamw::AdamW;
+use crate::step::adamw::{AdamW, GradientFactor};
 use crate::step::muon::Muon;
 
 /// The optimizer of a stage: AdamW, and, if the config names Muon, Muon for the weight matrices of the transformer blocks.
@@ -26,26 +23,6 @@ pub struct StageOptimizer {
     all: ModuleOptimizer,
     muon: Option<(Muon, ParamGroup)>,
     factor: GradientFactor,
-}
-
-/// Factor of all gradients during an update, shared by the optimizers.
-#[derive(Clone, Default)]
-pub struct GradientFactor(Arc<AtomicU64>);
-
-impl GradientFactor {
-    fn set(&self, factor: f64) {
-        self.0.store(factor.to_bits(), Ordering::Relaxed);
-    }
-
-    pub fn get(&self) -> f64 {
-        f64::from_bits(self.0.load(Ordering::Relaxed))
-    }
-
-    /// Multiplies a gradient.
-    pub fn scale<const D: usize>(&self, grad: Tensor<D>) -> Tensor<D> {
-        let factor = self.get();
-        if factor == 1.0 { grad } else { grad.mul_scalar(factor) }
-    }
 }
 
 impl StageOptimizer {
