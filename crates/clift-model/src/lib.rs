@@ -127,7 +127,7 @@ pub use weights::file::{
 };
 pub use weights::hash::{renderer_hash, weights_hash};
 pub use weights::model_path::{ModelPath, check_condenser, check_sizes, refuse_checkpoint};
-pub use weights::patch_adapter::PatchAdapter;
+pub use weights::network_adapter::NetworkAdapter;
 pub use weights::published_keys::{
     PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };

@@ -16,7 +16,7 @@ use clift_core::{TEMPORARY, folder_of, publish_file};
 
 use crate::error::ModelError;
 use crate::weights::hash::visit;
-use crate::weights::patch_adapter::PatchAdapter;
+use crate::weights::network_adapter::NetworkAdapter;
 
 /// The parameters that were read from a file into a module, and those that were not.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -134,7 +134,7 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
 /// # Errors
 /// [`ModelError::Weights`] if the file cannot be read, a shape differs, or a value is not finite or wider than f32.
 pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<LoadReport, ModelError> {
-    load_adapted(module, part, path, PatchAdapter::default())
+    load_adapted(module, part, path, NetworkAdapter::default())
 }
 
 /// Reads parameters as [`load_part`], those between pixels and tokens through an adapter.
@@ -142,7 +142,7 @@ pub fn load_adapted<M: Module>(
     module: &mut M,
     part: &PathFilter,
     path: &Path,
-    adapter: PatchAdapter,
+    adapter: NetworkAdapter,
 ) -> Result<LoadReport, ModelError> {
     let store = SafetensorsStore::from_file(path).filter(part.clone());
     read(module, store.with_from_adapter(PyTorchToBurnAdapter.chain(Widen).chain(adapter)), part, path)

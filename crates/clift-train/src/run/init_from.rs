@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_model::{ModelPath, Network, PatchAdapter, check_condenser, find_shipped, load_adapted, refuse_checkpoint};
+use clift_model::{ModelPath, Network, NetworkAdapter, check_condenser, find_shipped, load_adapted, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};
 use crate::error::TrainError;
@@ -12,7 +12,7 @@ use crate::stage::interpolation::interpolate;
 
 /// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
 /// the same stage of another run, from a model directory, a weight file or the [shipped model](find_shipped), maybe through a
-/// [`PatchAdapter`]. Reports which parameters were loaded.
+/// [`NetworkAdapter`]. Reports which parameters were loaded.
 pub(crate) fn init_from(
     mut model: Network,
     config: &Config,
@@ -33,9 +33,9 @@ pub(crate) fn init_from(
     let path: &Path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     refuse_checkpoint(path)?;
     // The sizes of a weight file without a config are unknown.
-    let mut adapter = PatchAdapter::default();
+    let mut adapter = NetworkAdapter::default();
     if let Ok(found) = ModelPath::find(path) {
-        adapter = PatchAdapter::find(&config.model, &found.dir)?;
+        adapter = NetworkAdapter::find(&config.model, &found.dir)?;
         if stage == Stage::Stage2 {
             check_condenser(&config.model, &found.dir)?;
         }

@@ -1,11 +1,13 @@
-//! Weights of a network with shorter patches, for a network with longer ones: training goes on at a higher resolution, with as
-//! many tokens per view.
+//! Weights of a smaller network for a larger one: with shorter patches, so that training goes on at a higher resolution with as
+//! many tokens per view, or with half the width.
 
 use std::path::Path;
 
 use burn::store::burn_pack::Tensor as PackTensor;
 use burn::store::{ModuleAdapter, ModuleContext};
 use burn::tensor::{Bytes, DType, Shape};
+
+use clift_core::mix;
 
 use crate::error::ModelError;
 use crate::network::architecture::Architecture;
@@ -14,26 +16,30 @@ use crate::views::rays::RayFrame;
 use crate::weights::model_path::{check_equal_sizes, read_config};
 
 /// Adapts the layers between pixels and tokens to patches `factor` times as long, and from rays in the frame of the scene to rays
-/// in the frame of the camera. The default changes nothing.
+/// in the frame of the camera, and to twice the width. The default changes nothing.
 ///
 /// At first, the network sees the mean of every `factor` by `factor` pixels and repeats each pixel it renders as often. Rays in
 /// the frame of the camera keep the weights of directions and lose those of moments, which changes the image until it is trained.
+///
+/// A wider network has every channel, head and hidden value twice and computes the same. The weights of the two copies add up to
+/// the former weight, in unequal shares, so that the copies learn differently.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PatchAdapter {
+pub struct NetworkAdapter {
     /// Side of the patches in the file, in pixels.
     patch_size: usize,
     factor: usize,
     rays: RayFrame,
     drops_moments: bool,
+    is_doubled: bool,
 }
 
-impl Default for PatchAdapter {
+impl Default for NetworkAdapter {
     fn default() -> Self {
-        Self { patch_size: 1, factor: 1, rays: RayFrame::World, drops_moments: false }
+        Self { patch_size: 1, factor: 1, rays: RayFrame::World, drops_moments: false, is_doubled: false }
     }
 }
 
-impl PatchAdapter {
+impl NetworkAdapter {
     /// Returns the adapter of the weights in `dir` to `model`, and checks that the networks have equal sizes otherwise. Groups of
     /// views may differ.
     ///
@@ -42,30 +48,33 @@ impl PatchAdapter {
     pub fn find(model: &ModelConfig, dir: &Path) -> Result<Self, ModelError> {
         let Some(found) = read_config(dir)? else { return Ok(Self::default()) };
         let mut model = ModelConfig { group_size: found.group_size, ..model.clone() };
+        let widths = |config: &ModelConfig| [config.dim, config.num_heads, config.feed_forward_dim];
         let factor = model.patch_size / found.patch_size.max(1);
-        let adapter = Self {
-            patch_size: found.patch_size,
-            factor,
-            rays: found.rays,
-            drops_moments: found.rays == RayFrame::World && model.rays == RayFrame::Camera,
-        };
-        let is_longer = factor * found.patch_size == model.patch_size && found.architecture == Architecture::Clift;
-        if is_longer && (factor > 1 || adapter.drops_moments) {
-            model.patch_size = found.patch_size;
-            model.rays = if adapter.drops_moments { found.rays } else { model.rays };
-            check_equal_sizes(&model, &found, dir)?;
-            return Ok(adapter);
+        let mut adapter = Self { patch_size: found.patch_size, rays: found.rays, ..Self::default() };
+        if found.architecture == Architecture::Clift {
+            if factor * found.patch_size == model.patch_size {
+                adapter.factor = factor;
+                adapter.drops_moments = found.rays == RayFrame::World && model.rays == RayFrame::Camera;
+                model.patch_size = found.patch_size;
+                model.rays = if adapter.drops_moments { found.rays } else { model.rays };
+            }
+            if widths(&model) == widths(&found).map(|width| 2 * width) {
+                adapter.is_doubled = true;
+                [model.dim, model.num_heads, model.feed_forward_dim] = widths(&found);
+            }
         }
         check_equal_sizes(&model, &found, dir)?;
-        Ok(Self::default())
+        let is_equal = adapter.factor == 1 && !adapter.drops_moments && !adapter.is_doubled;
+        Ok(if is_equal { Self::default() } else { adapter })
     }
 
     /// Describes the change; `None` without one.
     pub fn describe(&self) -> Option<String> {
-        let Self { patch_size, factor, drops_moments, .. } = *self;
+        let Self { patch_size, factor, drops_moments, is_doubled, .. } = *self;
         let longer = (factor > 1).then(|| format!("patches of {} instead of {patch_size} pixels", factor * patch_size));
         let rays = drops_moments.then(|| "rays in the frame of the camera instead of the scene".into());
-        let changes: Vec<String> = longer.into_iter().chain(rays).collect();
+        let wider = is_doubled.then(|| "twice the width".into());
+        let changes: Vec<String> = longer.into_iter().chain(rays).chain(wider).collect();
         (!changes.is_empty()).then(|| format!("adapted to {}", changes.join(" and ")))
     }
 
@@ -83,46 +92,88 @@ impl PatchAdapter {
         (patch_size * patch_size * channels, sources)
     }
 
-    fn adapted(&self, tensor: &PackTensor) -> Option<PackTensor> {
+    /// Returns the values of a layer with longer patches.
+    fn with_longer_patches(&self, name: &str, layer: Values) -> Values {
         // Linear weights are `[inputs, outputs]`.
-        let (num_colors, rays, axis, scale) = match &*tensor.name {
+        let (num_colors, rays, axis, scale) = match name {
             "encoder.patch_embed.weight" => (3, true, 0, 1.0 / (self.factor * self.factor) as f32),
             "renderer.ray_embed.weight" => (0, true, 0, 1.0 / (self.factor * self.factor) as f32),
-            "renderer.to_pixels.weight" => (3, false, 1, 1.0),
-            "renderer.to_pixels.bias" => (3, false, 0, 1.0),
-            _ => return None,
+            "renderer.to_pixels.weight" | "renderer.to_pixels.bias" => (3, false, 1, 1.0),
+            _ => return layer,
         };
         let (expected_len, sources) = self.sources(num_colors, rays);
-        let [rows, columns] = match tensor.shape[..] {
+        // Another shape is an error of the file, with its own message.
+        if layer.shape[axis] == expected_len { layer.gather(axis, &sources, |_, value| value * scale) } else { layer }
+    }
+
+    /// Returns the values of a layer of twice the width.
+    fn with_copies(name: &str, layer: Values) -> Values {
+        let parts = if name.contains("in_proj") {
+            3
+        } else if name.contains("kv_proj") {
+            2
+        } else {
+            1
+        };
+        let part = layer.shape[1] / parts;
+        let copies: Vec<usize> = (0..parts).flat_map(|i| (0..2 * part).map(move |j| i * part + j % part)).collect();
+        let layer =
+            if name.starts_with("renderer.to_pixels") { layer } else { layer.gather(1, &copies, |_, value| value) };
+        if !name.ends_with(".weight") || name.ends_with("_embed.weight") {
+            return layer;
+        }
+        let [inputs, outputs] = layer.shape;
+        let rows: Vec<usize> = (0..2 * inputs).map(|i| i % inputs).collect();
+        layer.gather(0, &rows, |at, value| {
+            // From 0.2 to 0.8, and the rest for the second copy.
+            let share = 0.2 + 0.6 * (mix((at % (inputs * outputs)) as u64) >> 40) as f32 / (1 << 24) as f32;
+            value * if at < inputs * outputs { share } else { 1.0 - share }
+        })
+    }
+
+    fn adapted(&self, tensor: &PackTensor) -> Option<PackTensor> {
+        let shape = match tensor.shape[..] {
             [rows, columns] => [rows, columns],
-            [rows] => [rows, 1],
+            [columns] => [1, columns],
             _ => return None,
         };
-        let len = if axis == 0 { rows } else { columns };
-        // Another shape is an error of the file, with its own message.
-        if tensor.dtype != DType::F32 || len != expected_len {
+        if tensor.dtype != DType::F32 {
             return None;
         }
         let bytes = tensor.to_bytes().ok()?;
-        let values: Vec<f32> =
-            bytes.chunks_exact(4).map(|bytes| f32::from_le_bytes(bytes.try_into().expect("four bytes"))).collect();
-        let mut shape = tensor.shape[..].to_vec();
-        shape[axis] = sources.len();
-        let gathered: Vec<f32> = if axis == 0 {
-            sources
-                .iter()
-                .flat_map(|&row| &values[row * columns..(row + 1) * columns])
-                .map(|value| value * scale)
-                .collect()
-        } else {
-            values.chunks_exact(columns).flat_map(|row| sources.iter().map(|&column| row[column])).collect()
-        };
-        let (name, shape) = (tensor.name.clone(), Shape::from(shape));
-        Some(PackTensor::new(name, DType::F32, shape, tensor.param_id, Bytes::from_elems(gathered)))
+        let value = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().expect("four bytes"));
+        let layer = Values { shape, values: bytes.chunks_exact(4).map(value).collect() };
+        let layer = self.with_longer_patches(&tensor.name, layer);
+        let layer = if self.is_doubled { Self::with_copies(&tensor.name, layer) } else { layer };
+        let shape = Shape::from(layer.shape[2 - tensor.shape[..].len()..].to_vec());
+        let values = Bytes::from_elems(layer.values);
+        Some(PackTensor::new(tensor.name.clone(), DType::F32, shape, tensor.param_id, values))
     }
 }
 
-impl ModuleAdapter for PatchAdapter {
+/// A matrix, or a row.
+struct Values {
+    shape: [usize; 2],
+    values: Vec<f32>,
+}
+
+impl Values {
+    /// Takes the rows (`axis` 0) or columns of `sources`, changed by a function of their new position and their value.
+    fn gather(self, axis: usize, sources: &[usize], change: impl Fn(usize, f32) -> f32) -> Self {
+        let Self { shape: [_, old_columns], values } = self;
+        let mut shape = self.shape;
+        shape[axis] = sources.len();
+        let [rows, columns] = shape;
+        let source = |row: usize, column: usize| match axis {
+            0 => sources[row] * old_columns + column,
+            _ => row * old_columns + sources[column],
+        };
+        let values = (0..rows * columns).map(|i| change(i, values[source(i / columns, i % columns)])).collect();
+        Self { shape, values }
+    }
+}
+
+impl ModuleAdapter for NetworkAdapter {
     fn adapt(&self, tensor: PackTensor, _context: ModuleContext<'_>) -> PackTensor {
         if *self == Self::default() {
             return tensor;
@@ -144,7 +195,9 @@ mod tests {
     use super::*;
     use crate::network::architecture::CameraEncoding;
     use crate::network::model::Network;
+    use crate::network::parts::condenser::Condenser;
     use crate::testing::{assert_close, random, to_vec};
+    use crate::tokens::clusters::{Clusters, SceneClusters};
     use crate::views::upload::{Cameras, Views};
     use crate::weights::file::{load_adapted, save_weights};
 
@@ -212,7 +265,7 @@ mod tests {
         );
         let load = |config: &ModelConfig| {
             let mut network = Network::new(config, 4, &Device::flex());
-            let adapter = PatchAdapter::find(config, folder.path())?;
+            let adapter = NetworkAdapter::find(config, folder.path())?;
             load_adapted(&mut network, &PathFilter::all(), &path, adapter)?.require_all(&path)?;
             Ok::<_, ModelError>((network, adapter.describe()))
         };
@@ -239,5 +292,41 @@ mod tests {
         assert!(other.contains(" is [") && other.contains(", expected ["), "{other}");
         let wider = load(&ModelConfig { dim: 32, ..config(4, RayFrame::World) }).map(|_| ()).unwrap_err().to_string();
         assert!(wider.starts_with("`model.dim` = 32"), "{wider}");
+    }
+
+    #[test]
+    fn networks_of_twice_the_width_show_the_same_image() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.safetensors");
+        let mut narrow = Network::new(&config(2, RayFrame::World), 3, &Device::flex());
+        let Condenser::Paper(condenser) = &mut narrow.condenser else { panic!("the default variant") };
+        for gate in condenser.gates() {
+            gate.weight = gate.weight.clone().map(|weight| random(weight.dims(), 6, &weight.device()).cast(DType::F32));
+        }
+        save_weights(&narrow, &path).unwrap();
+        let text = "[model]\npatch_size = 2\ncamera_encoding = \"gta\"\ndim = 16\nnum_heads = 2\nfeed_forward_dim = 24\n\
+                    num_encoder_blocks = 1\nnum_renderer_blocks = 1\n";
+        std::fs::write(folder.path().join("config.toml"), text).unwrap();
+        let (context, targets) = views(2);
+        let num_tokens = 2 * 4 * 8;
+        let scene = SceneClusters::new((0..num_tokens).map(|i| i % 4).collect(), vec![0, 1, 2, 3]).unwrap();
+        let index = Clusters::new(vec![scene]).unwrap().upload(&Device::flex());
+        let images = |network: &Network| {
+            let lift = network.encode(&context);
+            [lift.clone(), network.condenser.forward(lift, &index)].map(|tokens| network.render(tokens, &targets))
+        };
+        let wide = ModelConfig { dim: 32, num_heads: 4, feed_forward_dim: 48, ..config(2, RayFrame::World) };
+        let mut network = Network::new(&wide, 4, &Device::flex());
+        let adapter = NetworkAdapter::find(&wide, folder.path()).unwrap();
+        assert_eq!(adapter.describe().as_deref(), Some("adapted to twice the width"));
+        load_adapted(&mut network, &PathFilter::all(), &path, adapter).unwrap().require_all(&path).unwrap();
+        for (image, expected) in images(&network).iter().zip(images(&narrow)) {
+            assert_close(image, &expected, 1e-5);
+        }
+        let both = ModelConfig { patch_size: 4, ..wide };
+        let adapter = NetworkAdapter::find(&both, folder.path()).unwrap();
+        assert!(adapter.describe().unwrap().ends_with("pixels and twice the width"));
+        let mut network = Network::new(&both, 4, &Device::flex());
+        load_adapted(&mut network, &PathFilter::all(), &path, adapter).unwrap().require_all(&path).unwrap();
     }
 }
