@@ -16,8 +16,8 @@ pub struct MatrixShape {
 /// Class of an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum AdapterClass {
-    /// Cooperative matrices with f16 operands and f32 sums. Such adapters have operations of planes, too, although `CubeCL` does
-    /// not say so of software.
+    /// Cooperative matrices with f16 operands and f32 sums. Such adapters also have plane operations, which `CubeCL` does
+    /// not report for software.
     Matrices(MatrixShape),
     /// No cooperative matrices: sums in registers, in f32.
     Registers,

@@ -50,10 +50,10 @@ pub struct DataConfig {
     pub image_cache: ImageCacheConfig,
     /// Sampling of context and target frames for training.
     pub views: ViewSampler,
-    /// Number of threads that prepare batches; 0 prepares them between the steps. By default 1 for training on a CPU, and one
-    /// a core, at most 16, for training on a GPU.
+    /// Number of threads that prepare batches; 0 prepares them between the steps. Unset: 1 on a CPU; on a GPU one per core, at
+    /// most 16.
     pub num_threads: Option<usize>,
-    /// Number of batches prepared ahead.
+    /// Number of batches prepared ahead, at least one per thread.
     pub num_prefetch: usize,
 }
 
@@ -81,16 +81,7 @@ impl Default for DataConfig {
     }
 }
 
-/// Most threads that prepare batches by default.
-const MAX_THREADS: usize = 16;
-
 impl DataConfig {
-    /// Returns the number of threads that prepare batches of training on a CPU or on another device.
-    pub fn loader_threads(&self, on_cpu: bool) -> usize {
-        let cores = || std::thread::available_parallelism().map_or(1, usize::from).min(MAX_THREADS);
-        self.num_threads.unwrap_or_else(|| if on_cpu { 1 } else { cores() })
-    }
-
     /// Returns the same data with half as many columns and rows, also of the frames of synthetic scenes.
     #[must_use]
     pub fn at_half_resolution(&self) -> Self {

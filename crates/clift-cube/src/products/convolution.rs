@@ -1,4 +1,4 @@
-//! Convolutions of 3 x 3 values with zeros around the image, as products.
+//! Convolutions by kernels of 3 x 3 with zeros around the image: im2col, then a product.
 // B images, H rows, W columns, C channels
 
 use cubecl::prelude::*;
@@ -7,8 +7,8 @@ use crate::buffers::buffer::{Buffer, Matrices, Values};
 use crate::buffers::elementwise::{UNITS, cube_count};
 use crate::products::product::Product;
 
-/// Values around a pixel.
-pub const NEIGHBOURS: usize = 9;
+/// Values of a kernel.
+pub const KERNEL_LEN: usize = 9;
 
 /// Computes a convolution of images `[B, H, W, C]`: `[B, H, W, outputs]`. `weight` is a matrix `[9 C, outputs]` in the order
 /// row, column, channel. Allocates `9 B H W C` values.
@@ -20,42 +20,36 @@ pub fn convolve(
     outputs: usize,
     bias: Option<&Buffer>,
 ) -> Buffer {
-    let (pixels, terms) = (height * width, NEIGHBOURS * channels);
-    let neighbours = Buffer::empty(client, batch * pixels * terms, Values::F32);
+    let (pixels, terms) = (height * width, KERNEL_LEN * channels);
+    let windows = Buffer::empty(client, batch * pixels * terms, Values::F32);
     let vector = if channels.is_multiple_of(4) { 4 } else { 1 };
-    let units = neighbours.len / vector;
+    let units = windows.len / vector;
     // SAFETY: the kernel compares its index with the length and pixels with the sizes.
     unsafe {
-        gather_neighbours::launch_unchecked(
+        im2col::launch_unchecked(
             client,
             cube_count(units.div_ceil(UNITS)),
             CubeDim::new_1d(UNITS as u32),
             vector,
             x.arg(vector),
-            neighbours.arg(vector),
+            windows.arg(vector),
             height,
             width,
             channels / vector,
         );
     }
-    let lhs = Matrices::contiguous(&neighbours, terms);
+    let lhs = Matrices::contiguous(&windows, terms);
     Product { bias, ..Product::new(lhs, weight, [batch * pixels, outputs, terms]) }.run(client)
 }
 
-/// Copies the neighbours of every pixel side by side, zeros outside the image. `channels` counts vectors.
+/// Copies the 3 x 3 window of every pixel to a row, zeros outside the image. `channels` counts vectors.
 #[cube(launch_unchecked)]
-fn gather_neighbours<V: Size>(
-    x: &[Vector<f32, V>],
-    output: &mut [Vector<f32, V>],
-    height: usize,
-    width: usize,
-    channels: usize,
-) {
+fn im2col<V: Size>(x: &[Vector<f32, V>], output: &mut [Vector<f32, V>], height: usize, width: usize, channels: usize) {
     let index = ABSOLUTE_POS;
     if index < output.len() {
         let channel = index % channels;
-        let neighbour = index / channels % NEIGHBOURS;
-        let pixel = index / (channels * NEIGHBOURS);
+        let neighbour = index / channels % KERNEL_LEN;
+        let pixel = index / (channels * KERNEL_LEN);
         // One more than the position, to stay positive.
         let row = pixel / width % height + neighbour / 3;
         let column = pixel % width + neighbour % 3;
@@ -78,7 +72,7 @@ mod tests {
         let Some(client) = client() else { return };
         for [batch, height, width, channels, outputs] in [[1, 1, 1, 3, 5], [2, 5, 7, 3, 8], [1, 6, 4, 8, 70]] {
             let x = random(batch * height * width * channels, 1);
-            let weight = random(NEIGHBOURS * channels * outputs, 2);
+            let weight = random(KERNEL_LEN * channels * outputs, 2);
             let bias = random(outputs, 3);
             let mut expected = Vec::new();
             for (image, row, column, output) in (0..batch * height * width * outputs).map(|i| {
@@ -86,7 +80,7 @@ mod tests {
                 (pixel / (height * width), pixel / width % height, pixel % width, i % outputs)
             }) {
                 let mut sum = f64::from(bias[output]);
-                for (n, channel) in (0..NEIGHBOURS).flat_map(|n| (0..channels).map(move |channel| (n, channel))) {
+                for (n, channel) in (0..KERNEL_LEN).flat_map(|n| (0..channels).map(move |channel| (n, channel))) {
                     let (row, column) = ((row + n / 3).wrapping_sub(1), (column + n % 3).wrapping_sub(1));
                     if row < height && column < width {
                         let value = x[((image * height + row) * width + column) * channels + channel];

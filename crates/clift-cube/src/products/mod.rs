@@ -1,5 +1,5 @@
 //! Products, on `register_product` (f32) or `matrix_product` (cooperative matrices, f16), with an `epilogue`; `tiles` is the
-//! table of their tiles. `convolution` is a product with the neighbours of every pixel.
+//! table of their tiles. `convolution` is a product of im2col.
 
 pub(crate) mod convolution;
 pub(crate) mod epilogue;

@@ -2,8 +2,7 @@
 
 use burn::tensor::Tensor;
 
-/// Multiplies matrices, `[.., M, K]` by `[.., K, N]`, in f32 by the kernels of clift on GPUs: Burn tries several kernels at the
-/// first product of every shape, which takes seconds each. On GPUs the product has no gradient.
+/// Multiplies matrices, `[.., M, K]` by `[.., K, N]`: on GPUs by the kernels of clift, with sums in f32 and without a gradient.
 pub fn matmul_without_gradient<const D: usize>(lhs: Tensor<D>, rhs: Tensor<D>) -> Tensor<D> {
     #[cfg(feature = "wgpu")]
     if let Some(product) = product_on_gpu(&lhs, &rhs) {

@@ -63,10 +63,7 @@ fn hint(share: f64, data: &DataConfig) -> Option<String> {
     if share <= MAX_SHARE {
         return None;
     }
-    let mut fixes = vec![match data.num_threads {
-        Some(count) => format!("raise data.num_threads ({count})"),
-        None => "set data.num_threads to the number of cores".into(),
-    }];
+    let mut fixes = vec!["raise data.num_threads".to_owned()];
     if data.source != SourceKind::Synthetic {
         // Training crops the images: their shorter side must stay above the size of training.
         let size = 2 * data.width.max(data.height);
@@ -96,10 +93,7 @@ mod tests {
         let data = DataConfig { source: SourceKind::Captures, width: 64, ..DataConfig::default() };
         let hints: Vec<String> = (0..200).filter_map(|_| wait.add(Duration::from_secs(1), &data)).collect();
         assert_eq!(hints.len(), 1);
-        assert!(
-            hints[0].contains("set data.num_threads to the number of cores, or reduce")
-                && hints[0].contains("--max-size 512")
-        );
+        assert!(hints[0].contains("raise data.num_threads, or reduce") && hints[0].contains("--max-size 512"));
         let mut wait = BatchWait::new();
         assert!((0..200).all(|_| wait.add(Duration::ZERO, &data).is_none()));
         assert!(!hint(0.5, &DataConfig::default()).unwrap().contains("convert"), "rooms have no files");

@@ -34,11 +34,16 @@ pub struct StagePlan<'a> {
     pub parts: BatchParts,
 }
 
+/// Most threads that prepare batches where the config sets no number.
+const MAX_THREADS: usize = 16;
+
 impl StagePlan<'_> {
     /// Starts to make the batches of the steps after `step`.
     pub(crate) fn prefetch(&self, step: u64) -> Prefetcher<StageBatch, TrainError> {
         let (data, make) = (&self.config.data, self.batches.clone());
-        let threads = data.loader_threads(self.config.device.is_cpu());
+        // A CPU trains on all threads.
+        let unset = if self.config.device.is_cpu() { 1 } else { rayon::current_num_threads().min(MAX_THREADS) };
+        let threads = data.num_threads.unwrap_or(unset);
         Prefetcher::new(move |step| make(step), step, self.settings.steps, threads, data.num_prefetch.max(threads))
     }
 

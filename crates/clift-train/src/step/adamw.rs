@@ -13,8 +13,14 @@ use crate::config::config::OptimizerConfig;
 const EPSILON: f32 = 1e-8;
 
 /// Factor of all gradients during an update, shared by the optimizers.
-#[derive(Clone, Default)]
+#[derive(Clone)]
 pub struct GradientFactor(Arc<AtomicU64>);
+
+impl Default for GradientFactor {
+    fn default() -> Self {
+        Self(Arc::new(AtomicU64::new(1.0_f64.to_bits())))
+    }
+}
 
 impl GradientFactor {
     pub fn set(&self, factor: f64) {

@@ -149,7 +149,7 @@ pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<
     })
 }
 
-/// Returns the factor of gradients of a norm that limits the norm to `max_norm`.
+/// Returns the factor that clips gradients of a global norm to `max_norm`.
 pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     // PyTorch's guard against a norm of zero.
     (max_norm / (norm + 1e-6)).min(1.0)
@@ -254,9 +254,13 @@ mod tests {
     #[test]
     fn five_updates_of_muon_equal_the_definition_in_f64() {
         check_muon(&Device::flex());
-        // Without an adapter there is no such device.
-        if let Ok(device) = clift_model::DeviceName::Wgpu.open() {
-            check_muon(&device);
+        // `wgpu_suite` reports a machine without an adapter.
+        match clift_model::DeviceName::Wgpu.open() {
+            Ok(device) => check_muon(&device),
+            Err(error) if clift_model::DeviceName::Wgpu.is_built() => {
+                assert!(std::env::var_os("CLIFT_REQUIRE_WGPU").is_none(), "{error}");
+            }
+            Err(_) => {}
         }
     }
 

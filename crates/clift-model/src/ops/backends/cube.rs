@@ -234,22 +234,21 @@ impl Kernels for Cube {
         grad: FloatTensor<Self>,
     ) -> FloatTensor<Self> {
         match images_at_once(&grad).filter(|_| is_native(&weight)) {
-            // The convolution of the gradient by the weights of the opposite neighbours.
             Some(images) => convolve(&grad, images, convolution::weight_of_gradient::<Self>(weight), None),
             None => convolution::backward::<Self>(x, weight, grad),
         }
     }
 }
 
-/// Most bytes of the neighbours of all pixels that are kept at once.
-const MAX_NEIGHBOURS: u64 = 1 << 30;
+/// Most bytes of the windows of im2col.
+const MAX_WINDOWS: u64 = 1 << 30;
 
-/// Returns the number of images `[B, C, H, W]` whose pixels' neighbours are kept at once; `None` if the kernel does not accept
+/// Returns how many of the images `[B, C, H, W]` fit in [`MAX_WINDOWS`]; `None` if none does or the kernel does not accept
 /// them.
 fn images_at_once(x: &FloatTensor<Cube>) -> Option<usize> {
-    let limit = MAX_NEIGHBOURS.min(x.client.properties().memory.max_page_size);
+    let limit = MAX_WINDOWS.min(x.client.properties().memory.max_page_size);
     let [batch, channels, height, width] = x.shape().dims();
-    let images = limit as usize / (4 * native::NEIGHBOURS * channels * height * width).max(1);
+    let images = limit as usize / (4 * native::KERNEL_LEN * channels * height * width).max(1);
     (is_native(x) && images > 0).then_some(images.min(batch))
 }
 

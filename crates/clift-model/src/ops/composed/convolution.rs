@@ -18,7 +18,7 @@ fn options() -> ConvOptions<2> {
     ConvOptions::new([1, 1], [1, 1], [1, 1], 1)
 }
 
-/// Returns the weights `[3, 3, O, I]` by which the gradient of the output is convolved: those of the opposite neighbours.
+/// Returns the kernel of the gradient, `[3, 3, O, I]`: flipped along rows and columns, with inputs and outputs swapped.
 #[cfg(feature = "wgpu")]
 pub(crate) fn weight_of_gradient<B: Backend>(weight: FloatTensor<B>) -> FloatTensor<B> {
     B::float_permute(B::float_flip(weight, &[2, 3]), &[2, 3, 0, 1])

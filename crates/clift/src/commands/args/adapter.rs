@@ -15,6 +15,6 @@ pub fn name_adapter(device: DeviceName, compiles: bool) {
         print_warning("this adapter is software on the CPU: `--device flex` is many times faster");
     }
     if compiles {
-        print_note(&format!("compiling kernels for {}: the first step takes up to some minutes", adapter.name));
+        print_note(&format!("compiling kernels for {}: the first step may take minutes", adapter.name));
     }
 }
