@@ -323,9 +323,9 @@ fn prepare(base: &Path) {
     }
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
     take_small_images(base, &["-o".into(), "models/re10k".into()]);
-    let mut rooms = ["train", "configs/rooms.toml"].map(str::to_owned).to_vec();
+    let mut rooms = ["train", "configs/rooms-64.toml"].map(str::to_owned).to_vec();
     shrink(&mut rooms);
-    rooms.extend(["--set", "run_dir=runs/rooms"].map(str::to_owned));
+    rooms.extend(["--set", "run_dir=runs/rooms", "--set", "model.patch_size=8"].map(str::to_owned));
     clift(&rooms.iter().map(String::as_str).collect::<Vec<_>>());
     for name in ["runs/capture", "runs/attic"] {
         copy(&base.join("runs/rooms"), name);

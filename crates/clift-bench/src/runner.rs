@@ -95,7 +95,8 @@ pub fn run_bench(
     let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(is_measured).collect();
     let total = cases.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;
-    let peak = || if config.device == DeviceName::Flex { config.precision.peak_flops() } else { None };
+    let device = config.device.open()?;
+    let peak = || config.precision.peak_flops(&device);
     let mut peak_flops = peak();
     let mut rows = Vec::with_capacity(cases.len());
     for case in cases {

@@ -37,10 +37,20 @@ use crate::output::stdout;
 /// Runs the command line of this process and returns the exit code: 0 done, 1 failed, 2 invalid command line, config or
 /// model, 129 (closed terminal), 130 (Ctrl-C) or 143 (SIGTERM) interrupted.
 pub fn main() -> ExitCode {
+    quiet_mesa();
     let args = Args::parse();
     args.verbosity().choose();
     keep_freed_memory();
     threads::flush_subnormals(|| run(args))
+}
+
+/// Turns off a Vulkan layer of Mesa where no desktop runs. It only reorders adapters, and asks Wayland for the one in use, which
+/// prints `error: XDG_RUNTIME_DIR is invalid or not set` several times.
+fn quiet_mesa() {
+    if cfg!(target_os = "linux") && std::env::var_os("XDG_RUNTIME_DIR").is_none() {
+        // SAFETY: no other thread runs yet.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
+    }
 }
 
 fn run(args: Args) -> ExitCode {

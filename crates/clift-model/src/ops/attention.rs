@@ -11,7 +11,7 @@ use burn::tensor::{Tensor, assert_shape};
 use crate::ops::autodiff::Differentiable;
 use crate::ops::backends::dispatch::operations;
 use crate::ops::composed::attention::{AttentionOutput, Qkv};
-use crate::ops::kernels::{HeadConfig, Kernels, SavedTensor};
+use crate::ops::kernels::{HeadConfig, Kernels, SavedQkv};
 use crate::ops::mac_counter;
 
 /// Computes attention among the tokens of a scene, `softmax(q k^T / sqrt(head width)) v`, unmasked.
@@ -62,7 +62,7 @@ struct Sdpa(HeadConfig);
 /// Inputs and results of the forward pass.
 #[derive(Clone, Debug)]
 struct SavedAttention<T> {
-    inputs: Qkv<SavedTensor<T>>,
+    inputs: SavedQkv<T>,
     results: AttentionOutput<T>,
 }
 
@@ -71,9 +71,8 @@ impl Sdpa {
         self,
         inputs: Qkv<FloatTensor<B>>,
     ) -> (FloatTensor<B>, SavedAttention<FloatTensor<B>>) {
-        let results = B::attention_forward(&inputs, self.0);
-        let output = results.output.clone();
-        (output, SavedAttention { inputs: inputs.map(|x| B::save(self.0.precision, x)), results })
+        let (results, inputs) = B::attention_forward_saving(inputs, self.0);
+        (results.output.clone(), SavedAttention { inputs, results })
     }
 
     fn gradients<B: Kernels>(

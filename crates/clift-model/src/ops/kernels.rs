@@ -122,6 +122,14 @@ pub trait Kernels: Backend {
         attention::forward::<Self>(inputs, heads.num_heads, matmul_in::<Self>(heads.precision))
     }
 
+    /// Computes [`attention_forward`](Self::attention_forward), and [saves](Self::save) the inputs for the backward.
+    fn attention_forward_saving(
+        inputs: Qkv<FloatTensor<Self>>,
+        heads: HeadConfig,
+    ) -> (AttentionOutput<FloatTensor<Self>>, SavedQkv<FloatTensor<Self>>) {
+        (Self::attention_forward(&inputs, heads), inputs.map(|x| Self::save(heads.precision, x)))
+    }
+
     /// Computes the gradients of the inputs, in their layout, from the results of the forward pass and the gradient
     /// `[B, N, D]` of the output.
     ///
@@ -204,6 +212,9 @@ pub struct SavedTensor<T> {
     /// Shape of a tensor that is saved in bf16, two of its values in each of `values`.
     pub(crate) packed: Option<Shape>,
 }
+
+/// Queries, keys and values that are saved for a backward.
+pub(crate) type SavedQkv<T> = Qkv<SavedTensor<T>>;
 
 impl<T> SavedTensor<T> {
     /// Saves a tensor as it is.

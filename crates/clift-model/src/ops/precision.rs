@@ -2,8 +2,8 @@
 //!
 //! Only the two operands of a product are rounded, in linear layers and attention, forward and backward. Weights, results,
 //! sums, norms, softmax, GELU, loss, gradients and optimizer state stay f32, as do the first layers, whose inputs are
-//! rays, and the attention inside clusters with its gates. In bf16, queries, keys, values and the input of GELU are also saved
-//! for the backward in bf16 ([`Kernels::save`](crate::ops::kernels::Kernels::save)).
+//! rays, and the attention inside clusters with its gates. Queries, keys, values and the input of GELU are also saved for the
+//! backward in bf16, and in f16 on GPUs with cooperative matrices ([`Kernels::save`](crate::ops::kernels::Kernels::save)).
 //!
 //! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
 //! forward pass. An operation reads the precision once; its backward uses that of its forward.
@@ -18,6 +18,7 @@ use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
 use crate::names::{names, parse_variant};
+use crate::ops::matmul::gpu_product_flops;
 
 /// Type of the operands of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
@@ -80,9 +81,14 @@ impl Precision {
         if missing_bf16(&device.clone().without_autodiff()).is_none() { Self::Bf16 } else { Self::F32 }
     }
 
-    /// Measures the floating-point operations per second of all threads in products that stay in registers; `None` for f16,
-    /// which has no native kernels.
-    pub fn peak_flops(self) -> Option<f64> {
+    /// Measures the most floating-point operations per second that a device reaches: on `flex`, all threads in products that stay
+    /// in registers; on a GPU, a large product. `None` for other devices, for software adapters, and for f16 on CPUs, which has no
+    /// native kernels.
+    pub fn peak_flops(self, device: &Device) -> Option<f64> {
+        let device = device.clone().without_autodiff();
+        if device != Device::flex() {
+            return gpu_product_flops(self, &device);
+        }
         self.native_operands().map(|operands| peak_flops(InstructionSet::detected(), operands))
     }
 

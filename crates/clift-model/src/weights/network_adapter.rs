@@ -1,13 +1,12 @@
 //! Weights of a smaller network for a larger one: with shorter patches, so that training goes on at a higher resolution with as
-//! many tokens per view, or with half the width.
+//! many tokens per view, or with fewer blocks.
 
 use std::path::Path;
 
+use burn::module::{Module, ModuleMapper, Param};
 use burn::store::burn_pack::Tensor as PackTensor;
 use burn::store::{ModuleAdapter, ModuleContext};
-use burn::tensor::{Bytes, DType, Shape};
-
-use clift_core::mix;
+use burn::tensor::{Bytes, DType, Shape, Tensor};
 
 use crate::error::ModelError;
 use crate::network::architecture::Architecture;
@@ -16,13 +15,13 @@ use crate::views::rays::RayFrame;
 use crate::weights::model_path::{check_equal_sizes, read_config};
 
 /// Adapts the layers between pixels and tokens to patches `factor` times as long, and from rays in the frame of the scene to rays
-/// in the frame of the camera, and to twice the width. The default changes nothing.
+/// in the frame of the camera, and adds blocks. The default changes nothing.
 ///
 /// At first, the network sees the mean of every `factor` by `factor` pixels and repeats each pixel it renders as often. Rays in
 /// the frame of the camera keep the weights of directions and lose those of moments, which changes the image until it is trained.
 ///
-/// A wider network has every channel, head and hidden value twice and computes the same. The weights of the two copies add up to
-/// the former weight, in unequal shares, so that the copies learn differently.
+/// Added blocks come after those of the file. Their output layers are zero, so that they change nothing at first
+/// ([`close_added_blocks`](Self::close_added_blocks)).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NetworkAdapter {
     /// Side of the patches in the file, in pixels.
@@ -30,12 +29,13 @@ pub struct NetworkAdapter {
     factor: usize,
     rays: RayFrame,
     drops_moments: bool,
-    is_doubled: bool,
+    /// Number of blocks of the encoder and of the renderer in the file, where the network has more.
+    num_blocks: Option<[usize; 2]>,
 }
 
 impl Default for NetworkAdapter {
     fn default() -> Self {
-        Self { patch_size: 1, factor: 1, rays: RayFrame::World, drops_moments: false, is_doubled: false }
+        Self { patch_size: 1, factor: 1, rays: RayFrame::World, drops_moments: false, num_blocks: None }
     }
 }
 
@@ -48,7 +48,6 @@ impl NetworkAdapter {
     pub fn find(model: &ModelConfig, dir: &Path) -> Result<Self, ModelError> {
         let Some(found) = read_config(dir)? else { return Ok(Self::default()) };
         let mut model = ModelConfig { group_size: found.group_size, ..model.clone() };
-        let widths = |config: &ModelConfig| [config.dim, config.num_heads, config.feed_forward_dim];
         let factor = model.patch_size / found.patch_size.max(1);
         let mut adapter = Self { patch_size: found.patch_size, rays: found.rays, ..Self::default() };
         if found.architecture == Architecture::Clift {
@@ -58,23 +57,25 @@ impl NetworkAdapter {
                 model.patch_size = found.patch_size;
                 model.rays = if adapter.drops_moments { found.rays } else { model.rays };
             }
-            if widths(&model) == widths(&found).map(|width| 2 * width) {
-                adapter.is_doubled = true;
-                [model.dim, model.num_heads, model.feed_forward_dim] = widths(&found);
+            let num_blocks = |config: &ModelConfig| [config.num_encoder_blocks, config.num_renderer_blocks];
+            let (blocks, former) = (num_blocks(&model), num_blocks(&found));
+            if blocks != former && blocks[0] >= former[0] && blocks[1] >= former[1] {
+                adapter.num_blocks = Some(former);
+                [model.num_encoder_blocks, model.num_renderer_blocks] = former;
             }
         }
         check_equal_sizes(&model, &found, dir)?;
-        let is_equal = adapter.factor == 1 && !adapter.drops_moments && !adapter.is_doubled;
+        let is_equal = adapter.factor == 1 && !adapter.drops_moments && adapter.num_blocks.is_none();
         Ok(if is_equal { Self::default() } else { adapter })
     }
 
     /// Describes the change; `None` without one.
     pub fn describe(&self) -> Option<String> {
-        let Self { patch_size, factor, drops_moments, is_doubled, .. } = *self;
+        let Self { patch_size, factor, drops_moments, num_blocks, .. } = *self;
         let longer = (factor > 1).then(|| format!("patches of {} instead of {patch_size} pixels", factor * patch_size));
         let rays = drops_moments.then(|| "rays in the frame of the camera instead of the scene".into());
-        let wider = is_doubled.then(|| "twice the width".into());
-        let changes: Vec<String> = longer.into_iter().chain(rays).chain(wider).collect();
+        let deeper = num_blocks.map(|[encoder, renderer]| format!("more than {encoder} + {renderer} blocks"));
+        let changes: Vec<String> = longer.into_iter().chain(rays).chain(deeper).collect();
         (!changes.is_empty()).then(|| format!("adapted to {}", changes.join(" and ")))
     }
 
@@ -103,32 +104,13 @@ impl NetworkAdapter {
         };
         let (expected_len, sources) = self.sources(num_colors, rays);
         // Another shape is an error of the file, with its own message.
-        if layer.shape[axis] == expected_len { layer.gather(axis, &sources, |_, value| value * scale) } else { layer }
+        if layer.shape[axis] == expected_len { layer.gather(axis, &sources, scale) } else { layer }
     }
 
-    /// Returns the values of a layer of twice the width.
-    fn with_copies(name: &str, layer: Values) -> Values {
-        let parts = if name.contains("in_proj") {
-            3
-        } else if name.contains("kv_proj") {
-            2
-        } else {
-            1
-        };
-        let part = layer.shape[1] / parts;
-        let copies: Vec<usize> = (0..parts).flat_map(|i| (0..2 * part).map(move |j| i * part + j % part)).collect();
-        let layer =
-            if name.starts_with("renderer.to_pixels") { layer } else { layer.gather(1, &copies, |_, value| value) };
-        if !name.ends_with(".weight") || name.ends_with("_embed.weight") {
-            return layer;
-        }
-        let [inputs, outputs] = layer.shape;
-        let rows: Vec<usize> = (0..2 * inputs).map(|i| i % inputs).collect();
-        layer.gather(0, &rows, |at, value| {
-            // From 0.2 to 0.8, and the rest for the second copy.
-            let share = 0.2 + 0.6 * (mix((at % (inputs * outputs)) as u64) >> 40) as f32 / (1 << 24) as f32;
-            value * if at < inputs * outputs { share } else { 1.0 - share }
-        })
+    /// Sets the output layers of added blocks to zero.
+    pub fn close_added_blocks<M: Module>(&self, network: M) -> M {
+        let Some(num_blocks) = self.num_blocks else { return network };
+        network.map(&mut CloseBlocks { num_blocks, path: Vec::new() })
     }
 
     fn adapted(&self, tensor: &PackTensor) -> Option<PackTensor> {
@@ -144,10 +126,42 @@ impl NetworkAdapter {
         let value = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().expect("four bytes"));
         let layer = Values { shape, values: bytes.chunks_exact(4).map(value).collect() };
         let layer = self.with_longer_patches(&tensor.name, layer);
-        let layer = if self.is_doubled { Self::with_copies(&tensor.name, layer) } else { layer };
         let shape = Shape::from(layer.shape[2 - tensor.shape[..].len()..].to_vec());
         let values = Bytes::from_elems(layer.values);
         Some(PackTensor::new(tensor.name.clone(), DType::F32, shape, tensor.param_id, values))
+    }
+}
+
+/// Sets the output layers of blocks from the numbers `num_blocks` on, of the encoder and of the renderer, to zero.
+struct CloseBlocks {
+    num_blocks: [usize; 2],
+    path: Vec<String>,
+}
+
+impl CloseBlocks {
+    fn is_closed(&self) -> bool {
+        let [network, blocks, number, .., layer, _] = &self.path[..] else { return false };
+        let former = match network.as_str() {
+            "encoder" => self.num_blocks[0],
+            "renderer" => self.num_blocks[1],
+            _ => return false,
+        };
+        let is_added = blocks == "blocks" && number.parse().is_ok_and(|number: usize| number >= former);
+        is_added && (layer == "out_proj" || layer == "down")
+    }
+}
+
+impl ModuleMapper for CloseBlocks {
+    fn enter_module(&mut self, name: &str, _kind: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _name: &str, _kind: &str) {
+        self.path.pop();
+    }
+
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        if self.is_closed() { param.map(|values| values.zeros_like()) } else { param }
     }
 }
 
@@ -158,8 +172,8 @@ struct Values {
 }
 
 impl Values {
-    /// Takes the rows (`axis` 0) or columns of `sources`, changed by a function of their new position and their value.
-    fn gather(self, axis: usize, sources: &[usize], change: impl Fn(usize, f32) -> f32) -> Self {
+    /// Takes the rows (`axis` 0) or columns of `sources`, times `scale`.
+    fn gather(self, axis: usize, sources: &[usize], scale: f32) -> Self {
         let Self { shape: [_, old_columns], values } = self;
         let mut shape = self.shape;
         shape[axis] = sources.len();
@@ -168,7 +182,7 @@ impl Values {
             0 => sources[row] * old_columns + column,
             _ => row * old_columns + sources[column],
         };
-        let values = (0..rows * columns).map(|i| change(i, values[source(i / columns, i % columns)])).collect();
+        let values = (0..rows * columns).map(|i| values[source(i / columns, i % columns)] * scale).collect();
         Self { shape, values }
     }
 }
@@ -195,9 +209,7 @@ mod tests {
     use super::*;
     use crate::network::architecture::CameraEncoding;
     use crate::network::model::Network;
-    use crate::network::parts::condenser::Condenser;
     use crate::testing::{assert_close, random, to_vec};
-    use crate::tokens::clusters::{Clusters, SceneClusters};
     use crate::views::upload::{Cameras, Views};
     use crate::weights::file::{load_adapted, save_weights};
 
@@ -295,38 +307,26 @@ mod tests {
     }
 
     #[test]
-    fn networks_of_twice_the_width_show_the_same_image() {
+    fn deeper_networks_show_the_same_image() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
-        let mut narrow = Network::new(&config(2, RayFrame::World), 3, &Device::flex());
-        let Condenser::Paper(condenser) = &mut narrow.condenser else { panic!("the default variant") };
-        for gate in condenser.gates() {
-            gate.weight = gate.weight.clone().map(|weight| random(weight.dims(), 6, &weight.device()).cast(DType::F32));
-        }
-        save_weights(&narrow, &path).unwrap();
+        let shallow = Network::new(&config(2, RayFrame::World), 3, &Device::flex());
+        save_weights(&shallow, &path).unwrap();
         let text = "[model]\npatch_size = 2\ncamera_encoding = \"gta\"\ndim = 16\nnum_heads = 2\nfeed_forward_dim = 24\n\
                     num_encoder_blocks = 1\nnum_renderer_blocks = 1\n";
         std::fs::write(folder.path().join("config.toml"), text).unwrap();
+        let deep = ModelConfig { num_encoder_blocks: 2, num_renderer_blocks: 3, ..config(2, RayFrame::World) };
+        let mut network = Network::new(&deep, 4, &Device::flex());
+        let adapter = NetworkAdapter::find(&deep, folder.path()).unwrap();
+        assert_eq!(adapter.describe().as_deref(), Some("adapted to more than 1 + 1 blocks"));
+        load_adapted(&mut network, &PathFilter::all(), &path, adapter).unwrap();
         let (context, targets) = views(2);
-        let num_tokens = 2 * 4 * 8;
-        let scene = SceneClusters::new((0..num_tokens).map(|i| i % 4).collect(), vec![0, 1, 2, 3]).unwrap();
-        let index = Clusters::new(vec![scene]).unwrap().upload(&Device::flex());
-        let images = |network: &Network| {
-            let lift = network.encode(&context);
-            [lift.clone(), network.condenser.forward(lift, &index)].map(|tokens| network.render(tokens, &targets))
-        };
-        let wide = ModelConfig { dim: 32, num_heads: 4, feed_forward_dim: 48, ..config(2, RayFrame::World) };
-        let mut network = Network::new(&wide, 4, &Device::flex());
-        let adapter = NetworkAdapter::find(&wide, folder.path()).unwrap();
-        assert_eq!(adapter.describe().as_deref(), Some("adapted to twice the width"));
-        load_adapted(&mut network, &PathFilter::all(), &path, adapter).unwrap().require_all(&path).unwrap();
-        for (image, expected) in images(&network).iter().zip(images(&narrow)) {
-            assert_close(image, &expected, 1e-5);
-        }
-        let both = ModelConfig { patch_size: 4, ..wide };
-        let adapter = NetworkAdapter::find(&both, folder.path()).unwrap();
-        assert!(adapter.describe().unwrap().ends_with("pixels and twice the width"));
-        let mut network = Network::new(&both, 4, &Device::flex());
-        load_adapted(&mut network, &PathFilter::all(), &path, adapter).unwrap().require_all(&path).unwrap();
+        let image = |network: &Network| network.render(network.encode(&context), &targets);
+        let open = to_vec(image(&network) - image(&shallow));
+        assert!(open.iter().any(|difference| difference.abs() > 1e-3));
+        assert_close(&image(&adapter.close_added_blocks(network)), &image(&shallow), 0.0);
+        let fewer = ModelConfig { num_encoder_blocks: 0, num_renderer_blocks: 3, ..config(2, RayFrame::World) };
+        let wrong = NetworkAdapter::find(&fewer, folder.path()).unwrap_err().to_string();
+        assert!(wrong.starts_with("`model.num_encoder_blocks` = 0: the weights are of a network with 1"), "{wrong}");
     }
 }

@@ -57,7 +57,7 @@ pub(crate) fn init_from(
         list(&loaded.missing),
         list(&loaded.unused)
     )));
-    Ok(model)
+    Ok(adapter.close_added_blocks(model))
 }
 
 /// Returns the weights at `stage2.weight_interpolation` of the way from the start of stage 2, which are those of stage 1 and

@@ -47,7 +47,10 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
                 estimate_run(&planned, num_ranks, *stage, *step, *step_s)
         {
             let (rate, left) = (flops_per_s / 1e9, duration(remaining_s));
-            let text = format!("{rate:.0} GFLOP/s; all stages and the evaluation: about {left} left");
+            let peak = planned.device.open().ok().and_then(|device| planned.precision.peak_flops(&device));
+            let share =
+                peak.map_or_else(String::new, |peak| format!(" ({:.0} % of the peak)", 100.0 * flops_per_s / peak));
+            let text = format!("{rate:.0} GFLOP/s{share}; all stages and the evaluation: about {left} left");
             sink.event(&Event::Message(text));
         }
     };

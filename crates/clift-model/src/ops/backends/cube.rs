@@ -4,11 +4,13 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Cube, TensorMetadata};
 use burn::tensor::DType;
 use clift_cube as native;
-use clift_cube::{AttentionInputs, AttentionResults, AttentionSizes, Buffer, ClusterSizes, NormHeads, PartTransform};
+use clift_cube::{
+    AdapterClass, AttentionInputs, AttentionResults, AttentionSizes, Buffer, ClusterSizes, NormHeads, PartTransform,
+};
 use clift_cube::{Matrices, Product, Values};
 use clift_kernels::HeadRows;
 
-use crate::ops::backends::cube_buffers::{MatrixBuffer, buffer, is_native, tensor};
+use crate::ops::backends::cube_buffers::{MatrixBuffer, buffer, is_native, is_operand, tensor};
 use crate::ops::composed::attention::{AttentionOutput, Qkv};
 use crate::ops::composed::cluster_attention::ClusterInputs;
 use crate::ops::composed::head_transform::Heads;
@@ -16,7 +18,7 @@ use crate::ops::composed::norms::{EPSILON, LayerNormInputs};
 use crate::ops::composed::{
     attention, cluster_attention, convolution, gelu, head_transform, linear, norms, primitives,
 };
-use crate::ops::kernels::{HeadConfig, Kernels, matmul_in};
+use crate::ops::kernels::{HeadConfig, Kernels, SavedQkv, SavedTensor, matmul_in};
 use crate::ops::precision::Precision;
 
 /// Most channels of a head that the kernels of attention accept.
@@ -27,7 +29,8 @@ impl Kernels for Cube {
         let (lhs_shape, rhs_shape) = (lhs.shape(), rhs.shape());
         let last = lhs_shape.num_dims() - 1;
         let is_same_batch = rhs_shape.num_dims() == last + 1 && (0..last - 1).all(|i| lhs_shape[i] == rhs_shape[i]);
-        if !is_native(&lhs) || !is_native(&rhs) || !is_same_batch {
+        let is_read = |x| if precision == Precision::F16 { is_operand(x) } else { is_native(x) };
+        if !is_read(&lhs) || !is_read(&rhs) || !is_same_batch {
             return primitives::matmul::<Self>(lhs, rhs);
         }
         let mut shape = lhs_shape.clone();
@@ -38,6 +41,15 @@ impl Kernels for Cube {
         let batch = (0..last - 1).map(|i| lhs_shape[i]).product();
         let product = Product { batch, operands: operands(precision), ..Product::new(lhs.view(), rhs.view(), sizes) };
         tensor(&like, product.run(&like.client), shape)
+    }
+
+    /// Copies a tensor to f16 in f16, where kernels round their operands to it.
+    fn save(precision: Precision, x: FloatTensor<Self>) -> SavedTensor<FloatTensor<Self>> {
+        if precision != Precision::F16 || !is_native(&x) || !has_matrices(&x) {
+            return SavedTensor::whole(x);
+        }
+        let half = native::cast(&x.client, &buffer(x.clone()), Values::F16);
+        SavedTensor::whole(tensor(&x, half, x.shape()))
     }
 
     fn linear_forward(precision: Precision, inputs: [FloatTensor<Self>; 3]) -> FloatTensor<Self> {
@@ -65,16 +77,18 @@ impl Kernels for Cube {
         tensor(&x, sums, [outputs])
     }
 
+    /// The result has the type of `x`.
     fn exact_gelu_forward(x: FloatTensor<Self>) -> FloatTensor<Self> {
-        if !is_native(&x) {
+        if !is_operand(&x) {
             return gelu::forward::<Self>(x);
         }
-        let output = native::gelu_forward(&x.client, &buffer(x.clone()), Values::F32);
+        let values = buffer(x.clone());
+        let output = native::gelu_forward(&x.client, &values, values.values);
         tensor(&x, output, x.shape())
     }
 
     fn exact_gelu_backward(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
-        if !is_native(&x) || !is_native(&grad) {
+        if !is_operand(&x) || !is_native(&grad) {
             return gelu::backward::<Self>(x, grad);
         }
         let output = native::gelu_backward(&x.client, &buffer(x.clone()), &buffer(grad));
@@ -142,6 +156,16 @@ impl Kernels for Cube {
         let [output, log_sum] = native::attention_forward(&like.client, sizes, &rows(&inputs, num_heads * head_width));
         let output = tensor(&like, output, [batch, num_queries, num_heads * head_width]);
         AttentionOutput { output, log_sum: Some(tensor(&like, log_sum, [batch, num_heads, num_queries])) }
+    }
+
+    /// Both passes read one copy of the inputs in f16.
+    fn attention_forward_saving(
+        inputs: Qkv<FloatTensor<Self>>,
+        heads: HeadConfig,
+    ) -> (AttentionOutput<FloatTensor<Self>>, SavedQkv<FloatTensor<Self>>) {
+        let precision = if native_sizes(&inputs, heads).is_some() { heads.precision } else { Precision::F32 };
+        let saved = inputs.map(|x| Self::save(precision, x));
+        (Self::attention_forward(&saved.clone().map(Self::restore), heads), saved)
     }
 
     fn attention_backward(
@@ -277,6 +301,10 @@ fn convolve(
     primitives::permute::<Cube>(output, [0, 3, 1, 2])
 }
 
+fn has_matrices(x: &FloatTensor<Cube>) -> bool {
+    matches!(AdapterClass::of(&x.client), AdapterClass::Matrices(_))
+}
+
 /// Returns the type of operands. Adapters do not have bf16.
 fn operands(precision: Precision) -> Values {
     if precision == Precision::F16 { Values::F16 } else { Values::F32 }
@@ -302,7 +330,7 @@ fn native_sizes(inputs: &Qkv<FloatTensor<Cube>>, heads: HeadConfig) -> Option<At
     let [_, num_keys, _] = key_value.shape().dims();
     let head_width = width / parts / heads.num_heads;
     let operands = operands(heads.precision);
-    let is_accepted = is_native(query) && is_native(key_value) && head_width <= MAX_HEAD_WIDTH;
+    let is_accepted = is_operand(query) && is_operand(key_value) && head_width <= MAX_HEAD_WIDTH;
     let num_heads = heads.num_heads;
     is_accepted.then_some(AttentionSizes { batch, num_heads, num_queries, num_keys, head_width, operands })
 }

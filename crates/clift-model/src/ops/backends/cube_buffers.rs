@@ -25,15 +25,27 @@ pub(crate) fn is_native(x: &CubeTensor) -> bool {
     x.dtype == DType::F32 && x.qparams.is_none()
 }
 
+/// Returns whether the kernels read the tensor as an operand of products: f32, or a copy in f16 that [`Kernels::save`] made.
+///
+/// [`Kernels::save`]: crate::ops::kernels::Kernels::save
+pub(crate) fn is_operand(x: &CubeTensor) -> bool {
+    is_native(x) || x.dtype == DType::F16 && x.qparams.is_none()
+}
+
+fn values(x: &CubeTensor) -> Values {
+    if x.dtype == DType::F16 { Values::F16 } else { Values::F32 }
+}
+
 /// Returns the values of a tensor in row-major order, copied if they lie otherwise.
 pub(crate) fn buffer(x: CubeTensor) -> Buffer {
     let x = into_contiguous(x);
-    Buffer { len: x.shape().num_elements(), handle: x.handle, values: Values::F32 }
+    Buffer { len: x.shape().num_elements(), values: values(&x), handle: x.handle }
 }
 
 /// Returns a tensor on the device of `like`.
 pub(crate) fn tensor(like: &CubeTensor, x: Buffer, shape: impl Into<Shape>) -> CubeTensor {
-    CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), shape.into(), x.handle, DType::F32)
+    let dtype = if x.values == Values::F16 { DType::F16 } else { DType::F32 };
+    CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), shape.into(), x.handle, dtype)
 }
 
 /// The matrices of the last two dimensions of a tensor.
@@ -69,7 +81,7 @@ impl MatrixBuffer {
         };
         let is_batched = (1..last - 1).all(|i| strides[i - 1] == strides[i] * shape[i]);
         let batch_stride = if last > 1 { strides[last - 2] } else { 0 };
-        let buffer = Buffer { handle: x.handle.clone(), len: shape.num_elements(), values: Values::F32 };
+        let buffer = Buffer { handle: x.handle.clone(), len: shape.num_elements(), values: values(x) };
         is_batched.then_some(Self { buffer, batch_stride, stride, transposed })
     }
 

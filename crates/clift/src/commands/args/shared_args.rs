@@ -12,7 +12,7 @@ use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
 /// Configs inside the program, by the paths that they have in the repository.
-const CONFIGS: [(&str, &str); 10] = [
+const CONFIGS: [(&str, &str); 11] = [
     ("configs/capture.toml", include_str!("../../../../../configs/capture.toml")),
     ("configs/dl3dv.toml", include_str!("../../../../../configs/dl3dv.toml")),
     ("configs/lvsm-ed-re10k.toml", include_str!("../../../../../configs/lvsm-ed-re10k.toml")),
@@ -20,6 +20,7 @@ const CONFIGS: [(&str, &str); 10] = [
     ("configs/lvsm-ed-tiny.toml", include_str!("../../../../../configs/lvsm-ed-tiny.toml")),
     ("configs/re10k-small.toml", include_str!("../../../../../configs/re10k-small.toml")),
     ("configs/re10k.toml", include_str!("../../../../../configs/re10k.toml")),
+    ("configs/rooms-64.toml", include_str!("../../../../../configs/rooms-64.toml")),
     ("configs/rooms.toml", include_str!("../../../../../configs/rooms.toml")),
     ("configs/synthetic.toml", include_str!("../../../../../configs/synthetic.toml")),
     ("configs/tiny.toml", include_str!("../../../../../configs/tiny.toml")),
