@@ -47,7 +47,7 @@ pub enum DataError {
     TruncatedImage { num_bytes: u64, path: PathBuf },
     /// The data of an image ends early or is damaged in its middle.
     #[error("bad scene: the image is damaged: {what}: {path}", path = path.display())]
-    DamagedImage { what: &'static str, path: PathBuf },
+    DamagedImage { what: String, path: PathBuf },
     /// An image has another aspect ratio than its camera.
     #[error(
         "bad scene: the image is {width}x{height}, aspect ratio {:.3}, but its camera has {camera_aspect:.3}; the image may \

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use strum::Display;
 
 use crate::error::DataError;
+use crate::image::codec::check_image;
 
 /// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
 /// With 0 no frame is.
@@ -80,5 +81,13 @@ pub trait SceneSource: Send + Sync {
     /// Returns the bytes of the JPEG or PNG file of a frame; `None` for images that are computed, or resampled on load.
     fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         Ok(None)
+    }
+
+    /// Checks the file of a frame, also for damage that decoders draw as a torn image. The default checks
+    /// [`encoded_frame`](Self::encoded_frame).
+    fn check_frame(&self, scene: usize, frame: usize) -> Result<(), DataError> {
+        let bytes = self.encoded_frame(scene, frame)?;
+        let bad = |what| DataError::BadImage { key: self.key(scene).to_owned(), frame, what };
+        bytes.map_or(Ok(()), |bytes| check_image(&bytes).map_err(bad))
     }
 }

@@ -66,7 +66,7 @@ impl BenchContext {
         // The rows use seeded images: the data of the config need not exist.
         let DataConfig { width, height, .. } = config.data;
         let synthetic = SyntheticConfig { width, height, ..SyntheticConfig::default() };
-        (config.data.source, config.data.synthetic) = (SourceKind::Synthetic, synthetic);
+        (config.data.source, config.data.root, config.data.synthetic) = (SourceKind::Synthetic, None, synthetic);
         config.validate()?;
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;

@@ -12,6 +12,7 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFo
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
+use crate::image::jpeg_scan::check_scans;
 
 /// Largest number of columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;
@@ -29,7 +30,8 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 /// [`DataError::BadImage`] with `key` and `frame` for another format, broken or truncated data, and a side above
 /// 16,384 pixels.
 pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
-    rgb_image(decode(bytes, key, frame)?.into_rgb8()).map_err(|what| bad_image(key, frame, what))
+    let image = decode(bytes).and_then(|image| rgb_image(image.into_rgb8()));
+    image.map_err(|what| bad_image(key, frame, what))
 }
 
 /// Decodes a JPEG or PNG file as [`decode_image`], and its alpha channel, `[height, width]`, if it has one.
@@ -38,21 +40,30 @@ pub(crate) fn decode_with_alpha(
     key: &str,
     frame: usize,
 ) -> Result<(RgbImage, Option<Vec<u8>>), DataError> {
-    let image = decode(bytes, key, frame)?;
+    let image = decode(bytes).map_err(|what| bad_image(key, frame, what))?;
     let alpha = image.color().has_alpha().then(|| image.to_rgba8().pixels().map(|pixel| pixel.0[3]).collect());
     Ok((rgb_image(image.into_rgb8()).map_err(|what| bad_image(key, frame, what))?, alpha))
+}
+
+/// Checks the data of a JPEG or PNG file, in a JPEG file also for damage that [`decode_image`] draws as a torn image.
+///
+/// # Errors
+/// The problem, as a sentence.
+pub(crate) fn check_image(bytes: &[u8]) -> Result<(), String> {
+    match known_format(bytes)? {
+        ImageFormat::Jpeg => check_scans(bytes).map_err(str::to_owned),
+        _ => decode(bytes).map(drop),
+    }
 }
 
 fn bad_image(key: &str, frame: usize, what: String) -> DataError {
     DataError::BadImage { key: key.to_owned(), frame, what }
 }
 
-fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<DynamicImage, DataError> {
-    let bad = |what: String| bad_image(key, frame, what);
-    let format = known_format(bytes).map_err(bad)?;
-    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), known_format(bytes)?);
     reader.limits(limits());
-    reader.decode().map_err(|error| bad(error.to_string()))
+    reader.decode().map_err(|error| error.to_string())
 }
 
 fn rgb_image(image: image::RgbImage) -> Result<RgbImage, String> {

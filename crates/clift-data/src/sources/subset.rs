@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use clift_core::{Camera, IntrinsicsNorm, RgbImage};
+use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::scene_source::SceneSource;
@@ -15,15 +16,23 @@ pub struct SceneSubset {
     scenes: Vec<usize>,
     /// Indices in this subset by those in `source`.
     positions: HashMap<usize, usize>,
-    /// The frames of [`SceneSource::held_out`] of this number are left out; the other frames are renumbered.
-    hold_out: usize,
+    /// The other frames are renumbered.
+    left_out: LeftOut,
+}
+
+/// Frames that are left out of every scene.
+enum LeftOut {
+    /// Those of [`SceneSource::held_out`] of this number.
+    HeldOut(usize),
+    /// Frames of the source, in order.
+    Frames(Vec<usize>),
 }
 
 impl SceneSubset {
     /// Keeps the scenes with these indices, which must exist in the source.
     pub fn new(source: Arc<dyn SceneSource>, scenes: Vec<usize>) -> Self {
         let positions = scenes.iter().enumerate().map(|(position, scene)| (*scene, position)).collect();
-        Self { source, scenes, positions, hold_out: 0 }
+        Self { source, scenes, positions, left_out: LeftOut::HeldOut(0) }
     }
 
     /// Keeps at most the first `num_scenes` scenes.
@@ -34,19 +43,42 @@ impl SceneSubset {
 
     /// Keeps all scenes without their held-out frames.
     pub(crate) fn without_held_out(source: Arc<dyn SceneSource>, hold_out: usize) -> Self {
-        Self { hold_out, ..Self::first(source, usize::MAX) }
+        Self { left_out: LeftOut::HeldOut(hold_out), ..Self::first(source, usize::MAX) }
+    }
+
+    /// Keeps one scene without the frames that [`SceneSource::check_frame`] refuses. Returns their positions and errors, too.
+    pub fn readable(source: Arc<dyn SceneSource>, scene: usize) -> Result<(Self, Vec<(usize, DataError)>), DataError> {
+        let frames = (0..source.num_frames(scene)?).into_par_iter();
+        let bad: Vec<_> = frames.filter_map(|frame| Some((frame, source.check_frame(scene, frame).err()?))).collect();
+        let left_out = LeftOut::Frames(bad.iter().map(|(frame, _)| *frame).collect());
+        Ok((Self { left_out, ..Self::new(source, vec![scene]) }, bad))
+    }
+
+    /// Returns the frames of a scene of the source that are left out, in order.
+    fn left_out(&self, scene: usize) -> Result<Vec<usize>, DataError> {
+        match &self.left_out {
+            LeftOut::HeldOut(every) => self.source.held_out(self.scenes[scene], *every),
+            LeftOut::Frames(frames) => Ok(frames.clone()),
+        }
+    }
+
+    fn has_all_frames(&self) -> bool {
+        match &self.left_out {
+            LeftOut::HeldOut(every) => *every == 0,
+            LeftOut::Frames(frames) => frames.is_empty(),
+        }
     }
 
     /// Returns the frames in the source of a scene of this subset.
     fn kept_frames(&self, scene: usize) -> Result<Vec<usize>, DataError> {
-        let scene = self.scenes[scene];
-        let held_out = self.source.held_out(scene, self.hold_out)?;
-        Ok((0..self.source.num_frames(scene)?).filter(|frame| held_out.binary_search(frame).is_err()).collect())
+        let left_out = self.left_out(scene)?;
+        let all = 0..self.source.num_frames(self.scenes[scene])?;
+        Ok(all.filter(|frame| left_out.binary_search(frame).is_err()).collect())
     }
 
     /// Returns the number of a kept frame in the source.
     fn frame_in_source(&self, scene: usize, frame: usize) -> Result<usize, DataError> {
-        if self.hold_out == 0 {
+        if self.has_all_frames() {
             return Ok(frame);
         }
         let kept = self.kept_frames(scene)?;
@@ -56,11 +88,11 @@ impl SceneSubset {
 
     /// Keeps the values of the kept frames, of values for the frames in the source.
     fn kept<T>(&self, scene: usize, values: Vec<T>) -> Result<Vec<T>, DataError> {
-        if self.hold_out == 0 {
+        if self.has_all_frames() {
             return Ok(values);
         }
-        let held_out = self.source.held_out(self.scenes[scene], self.hold_out)?;
-        let kept = values.into_iter().enumerate().filter(|(frame, _)| held_out.binary_search(frame).is_err());
+        let left_out = self.left_out(scene)?;
+        let kept = values.into_iter().enumerate().filter(|(frame, _)| left_out.binary_search(frame).is_err());
         Ok(kept.map(|(_, value)| value).collect())
     }
 }
@@ -79,8 +111,7 @@ impl SceneSource for SceneSubset {
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        let scene = self.scenes[scene];
-        Ok(self.source.num_frames(scene)? - self.source.held_out(scene, self.hold_out)?.len())
+        Ok(self.source.num_frames(self.scenes[scene])? - self.left_out(scene)?.len())
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
@@ -100,7 +131,15 @@ impl SceneSource for SceneSubset {
     }
 
     fn held_out(&self, scene: usize, every: usize) -> Result<Vec<usize>, DataError> {
-        if self.hold_out == 0 { self.source.held_out(self.scenes[scene], every) } else { Ok(Vec::new()) }
+        let held_out = self.source.held_out(self.scenes[scene], every)?;
+        match &self.left_out {
+            LeftOut::HeldOut(0) => Ok(held_out),
+            LeftOut::HeldOut(_) => Ok(Vec::new()),
+            LeftOut::Frames(left_out) => {
+                let kept = held_out.iter().filter(|frame| left_out.binary_search(frame).is_err());
+                Ok(kept.map(|frame| frame - left_out.partition_point(|other| other < frame)).collect())
+            }
+        }
     }
 
     fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
@@ -115,6 +154,10 @@ impl SceneSource for SceneSubset {
         self.source.frame_with_coverage(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }
 
+    fn check_frame(&self, scene: usize, frame: usize) -> Result<(), DataError> {
+        self.source.check_frame(self.scenes[scene], self.frame_in_source(scene, frame)?)
+    }
+
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         self.source.encoded_frame(self.scenes[scene], self.frame_in_source(scene, frame)?)
     }
@@ -123,8 +166,8 @@ impl SceneSource for SceneSubset {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene_source::is_held_out;
-    use crate::testing::rooms;
+    use crate::scene_source::{Split, is_held_out};
+    use crate::testing::{TestSource, re10k_mini, rooms};
 
     #[test]
     fn training_has_all_frames_but_the_held_out() {
@@ -141,5 +184,30 @@ mod tests {
             }
         }
         assert!(!is_held_out(0, 0) && is_held_out(0, 8) && is_held_out(16, 8) && !is_held_out(15, 8));
+    }
+
+    #[test]
+    fn damaged_frames_of_chunks_and_photos_are_left_out() {
+        let torn = |mut bytes: Vec<u8>| {
+            let middle = bytes.len() / 2;
+            bytes[middle..].iter_mut().take(120).for_each(|byte| *byte = 0);
+            bytes
+        };
+        let source = Arc::new(re10k_mini(Split::Test));
+        let (whole, bad) = SceneSubset::readable(source.clone(), 1).unwrap();
+        assert!(bad.is_empty() && whole.num_scenes() == 1 && whole.key(0) == source.key(1));
+        let encoded = move |scene, frame| {
+            let bytes = re10k_mini(Split::Test).encoded_frame(scene, frame).unwrap();
+            if [0, 3].contains(&frame) { bytes.map(torn) } else { bytes }
+        };
+        let damaged = TestSource::new(re10k_mini(Split::Test)).with_encoded_frames(encoded);
+        let (readable, bad) = SceneSubset::readable(Arc::new(damaged), 1).unwrap();
+        assert_eq!(bad.iter().map(|(frame, _)| *frame).collect::<Vec<_>>(), [0, 3]);
+        assert!(bad[0].1.to_string().contains("image data"), "{}", bad[0].1);
+        let num_frames = source.num_frames(1).unwrap();
+        assert_eq!(readable.num_frames(0).unwrap(), num_frames - 2);
+        assert_eq!(readable.frame(0, 2).unwrap(), source.frame(1, 4).unwrap());
+        // Of 0, 2 and 4, the second and the third are left, as frames 1 and 2.
+        assert_eq!(readable.held_out(0, 2).unwrap()[..2], [1, 2]);
     }
 }

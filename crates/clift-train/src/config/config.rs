@@ -93,6 +93,13 @@ impl Config {
         }
     }
 
+    /// Returns the files and folders that a run of this config reads.
+    pub fn input_paths(&self) -> Vec<PathBuf> {
+        let Self { data, stage1, stage2, loss, eval, .. } = self;
+        let weights = [&stage1.init_from, &stage2.init_from, &loss.vgg_weights, &eval.lpips_weights];
+        weights.into_iter().chain([&data.root, &eval.index]).flatten().cloned().collect()
+    }
+
     /// Returns the settings of an evaluation by `eval`, without LPIPS and external methods.
     pub(crate) fn sweep(&self, eval: EvalConfig) -> Sweep {
         let Self { seed, clusters, model, device, .. } = self;

@@ -1,8 +1,9 @@
 //! `clift encode`.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use clift_data::{ClipReader, Split};
+use clift_data::{ClipReader, SceneSource, SceneSubset, Split};
 use clift_model::TokenCount;
 use clift_scene::{
     ClusterMap, Coding, ContextChoice, EncodeOptions, Scene, SceneError, SceneOptions, TokenCoding, check_output_path,
@@ -13,7 +14,8 @@ use crate::commands::args::model_args::{ModelArgs, PhotoCrop};
 use crate::commands::args::parse::{parse_hold_out, parse_kb, parse_loss, parse_output, parse_split};
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
-use crate::output::output_file::OutputFile;
+use crate::output::output_file::{OutputFile, is_same_file};
+use crate::output::stdout::print_note;
 use crate::output::written_scene::print_scene;
 
 #[derive(Debug, clap::Args)]
@@ -110,6 +112,18 @@ impl EncodeArgs {
     }
 }
 
+/// Returns a scene without its damaged frames, which are named, and its number.
+fn readable_scene(source: Arc<dyn SceneSource>, key: Option<&str>) -> anyhow::Result<(Arc<dyn SceneSource>, usize)> {
+    let scene = find_scene(source.as_ref(), key)?;
+    let names = source.frame_names(scene)?;
+    let (readable, bad) = SceneSubset::readable(source, scene)?;
+    for (frame, error) in bad {
+        let name = names.get(frame).map_or_else(|| format!("frame {frame}"), Clone::clone);
+        print_note(&format!("skipped {name}: {error}"));
+    }
+    Ok((Arc::new(readable), 0))
+}
+
 /// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
@@ -118,7 +132,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let inputs: Vec<&Path> =
         [Some(&args.model), args.data.as_ref()].into_iter().flatten().map(PathBuf::as_path).collect();
     let clusters = args.save_clusters.as_ref().map(|path| OutputFile::new(path, args.force, &inputs)).transpose()?;
-    if args.save_clusters.as_ref() == Some(&args.out) {
+    if args.save_clusters.as_ref().is_some_and(|path| is_same_file(path, &args.out)) {
         usage_bail!("--save-clusters and -o name one file, {}; choose another name", args.out.display());
     }
     let model_args = ModelArgs::find(&args.model, args.data.as_deref(), &args.overrides)?;
@@ -127,7 +141,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         usage_bail!("--save-clusters: the tokens of {} are not clustered; leave the option out", given.display());
     }
     let source = model_args.open_data(args.split)?.source;
-    let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
+    let (source, scene) = readable_scene(source, args.scene.as_deref())?;
     let encode = EncodeOptions {
         context: args.contexts(&model_args, &source.frame_names(scene)?)?,
         hold_out: args.hold_out,

@@ -46,23 +46,27 @@ struct Sizes {
 }
 
 pub fn run(args: &FlopsArgs) -> anyhow::Result<()> {
-    let json = args.json.open(args.config.as_deref().as_slice())?;
-    let sizes = sizes(args)?;
+    let read = |path| anyhow::Ok((path, read_config(path, &args.set, check_plan)?.0));
+    let config = args.config.as_deref().map(read).transpose()?;
+    let json = match &config {
+        Some((path, config)) => args.json.open_for(path, config)?,
+        None => args.json.open(&[])?,
+    };
+    let sizes = sizes(args, config.map(|(_, config)| config));
     let counts = count(&sizes, args.convention)?;
     print_result(&report_text(&counts, args.convention))?;
     json.write(&counts)
 }
 
-fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
+fn sizes(args: &FlopsArgs, config: Option<Config>) -> Sizes {
     let given = |default: Vec<TokenCount>| if args.render.is_empty() { default } else { args.render.clone() };
-    let Some(path) = &args.config else {
+    let Some(config) = config else {
         let counts = given(PAPER_TOKENS.map(TokenCount::Count).into());
-        return Ok(Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts });
+        return Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts };
     };
-    let (config, _) = read_config(path, &args.set, check_plan)?;
     let counts = given(config.eval_stored_tokens().into_iter().rev().collect());
     let Config { model, data, eval, .. } = config;
-    Ok(Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts })
+    Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts }
 }
 
 fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
@@ -129,7 +133,7 @@ mod tests {
     fn counts(convention: FlopConvention) -> Counts {
         let json = JsonArg { path: None, force: false };
         let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };
-        count(&sizes(&args).unwrap(), convention).unwrap()
+        count(&sizes(&args, None), convention).unwrap()
     }
 
     #[test]

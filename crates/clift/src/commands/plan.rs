@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clift_data::plural;
 use clift_eval::table;
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PartPlan, Plan, check_plan, largest_tensor, memory_warning, plan};
@@ -13,8 +14,8 @@ use crate::output::stdout::{print_result, print_warning};
 use crate::output::units::{file_size, memory_size};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
-    let json = args.json.open(&[&args.config])?;
     let config = args.overrides.read(&args.config, check_plan)?;
+    let json = args.json.open_for(&args.config, &config)?;
     name_adapter(config.device, false);
     let plan = plan(&config, args.ranks)?;
     print_result(&report_text(&plan))?;
@@ -64,7 +65,7 @@ tokens per scene: {tokens}
 }
 
 fn cells(part: &PartPlan) -> [String; 5] {
-    let count = part.count.map_or_else(|| format!("every {}", part.unit), |count| format!("{count} {}s", part.unit));
+    let count = part.count.map_or_else(|| format!("every {}", part.unit), |count| plural(count as usize, part.unit));
     [
         part.part.into(),
         if part.trained_parameters == 0 { "-".into() } else { part.trained_parameters.to_string() },

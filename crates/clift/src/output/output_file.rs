@@ -53,9 +53,27 @@ impl OutputFile {
     }
 }
 
+/// Whether two paths name one file, which need not exist.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    let real = |path: &Path| {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        path.canonicalize().ok().or_else(|| Some(folder.canonicalize().ok()?.join(path.file_name()?)))
+    };
+    a == b || real(a).is_some_and(|a| real(b) == Some(a))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn files_are_the_same_by_any_path() {
+        let place = tempfile::tempdir().unwrap();
+        let at = |name: &str| place.path().join(name);
+        std::fs::create_dir(at("folder")).unwrap();
+        assert!(is_same_file(&at("a"), &at("folder/../a")) && is_same_file(Path::new("a"), Path::new("./a")));
+        assert!(!is_same_file(&at("a"), &at("b")) && !is_same_file(&at("a"), &at("folder/a")));
+    }
 
     #[test]
     fn existing_files_need_force_and_inputs_are_kept() {

@@ -14,9 +14,9 @@ use crate::files::bounded::read_bounded;
 use crate::files::listing::decode_name;
 use crate::geometry::lens::{Lens, Projection};
 use crate::image::codec::{
-    apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha, read_header,
+    apply_orientation, check_end, check_image, decode_image, decode_with_alpha, exif_orientation, has_alpha,
+    read_header,
 };
-use crate::image::jpeg_scan::check_scans;
 use crate::image::lanczos::resize_lanczos;
 use crate::image::undistort::Undistortion;
 
@@ -191,12 +191,9 @@ impl Photo {
         Ok(PhotoHeader { size, turn })
     }
 
-    /// Checks a JPEG file for damage in its middle.
+    /// Checks the data of the file.
     pub fn check_data(&self) -> Result<(), DataError> {
-        let bytes = self.read()?;
-        let is_jpeg = bytes.starts_with(b"\xff\xd8");
-        let checked = if is_jpeg { check_scans(&bytes) } else { Ok(()) };
-        checked.map_err(|what| DataError::DamagedImage { what, path: self.path.clone() })
+        check_image(&self.read()?).map_err(|what| DataError::DamagedImage { what, path: self.path.clone() })
     }
 
     /// Returns whether a mask or an alpha channel leaves pixels out.

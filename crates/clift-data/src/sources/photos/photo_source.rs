@@ -72,6 +72,8 @@ struct Entry {
     unusable: Vec<usize>,
     /// Orientations by which images are turned with their cameras, by index.
     turns: Vec<(usize, Orientation)>,
+    /// Whether the data of all images was checked at opening.
+    is_checked: bool,
 }
 
 /// Result of examining a scene at opening.
@@ -86,6 +88,8 @@ struct Findings {
     notes: Vec<String>,
     /// Reason of skipping the scene, with the error to return if all scenes fail.
     reason: Option<(String, Option<DataError>)>,
+    /// Whether the data of all images was checked.
+    is_checked: bool,
 }
 
 impl PhotoSource {
@@ -102,7 +106,7 @@ impl PhotoSource {
             let failed =
                 |error: DataError| Findings { reason: Some((error.to_string(), Some(error))), ..Findings::default() };
             let findings = findings.unwrap_or_else(failed);
-            let Findings { num_frames, unusable, turns, missing, counts, notes, reason } = findings;
+            let Findings { num_frames, unusable, turns, missing, counts, notes, reason, is_checked } = findings;
             let has_photos = num_frames > 0;
             if let Some((reason, error)) = reason {
                 report.skip(&folder.key, reason);
@@ -113,7 +117,7 @@ impl PhotoSource {
                     *total += count;
                     scenes.extend((count > 0).then(|| format!("{count} of {}", folder.key)));
                 }
-                scenes.push(Entry { folder: folder.clone(), num_frames, unusable, turns });
+                scenes.push(Entry { folder: folder.clone(), num_frames, unusable, turns, is_checked });
             }
             // Without any image, the reason of the scene covers all frames.
             for MissingPhoto { name, reason } in missing.into_iter().filter(|_| has_photos) {
@@ -277,7 +281,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
     counts[5] = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
     counts[6] = photos.iter().filter(|photo| photo.mask.is_some()).count();
-    Ok(Findings { num_frames, unusable, turns, missing, counts, notes, reason })
+    Ok(Findings { num_frames, unusable, turns, missing, counts, notes, reason, is_checked: checks_data })
 }
 
 impl SceneSource for PhotoSource {
@@ -321,6 +325,10 @@ impl SceneSource for PhotoSource {
             Some(cache) if !photo.has_coverage() => Ok((cache.scaled(&photo, || Ok(decode()?.0))?, None)),
             _ => decode(),
         }
+    }
+
+    fn check_frame(&self, scene: usize, frame: usize) -> Result<(), DataError> {
+        if self.scenes[scene].is_checked { Ok(()) } else { self.photo(scene, frame)?.check_data() }
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {

@@ -35,6 +35,7 @@ pub(crate) fn check_images(
     check: &mut SceneCheck,
 ) -> (Sizes, Vec<Option<Features>>) {
     let read = (0..cameras.len()).into_par_iter().map(|frame| {
+        source.check_frame(scene, frame)?;
         let image = source.frame(scene, frame)?;
         let mut hasher = DefaultHasher::new();
         image.rgb.hash(&mut hasher);

@@ -106,7 +106,8 @@ impl ModelArgs {
         let files = if has_files { self.config.data.files.clone() } else { FileOptions::default() };
         // The filters are for training scenes; the user chooses this scene by its key.
         let background = self.config.data.background;
-        let options = SourceOptions { files, background, ..SourceOptions::default() };
+        let min_size = image_size(&self.config);
+        let options = SourceOptions { files, background, min_size, ..SourceOptions::default() };
         let opened = open_source(&DatasetRoot::find(folder)?, split, &options)?;
         if opened.report.has_content() {
             print_note(&format!("{}: {}", folder.display(), opened.report));

@@ -93,6 +93,14 @@ impl JsonArg {
         let file = self.path.as_ref().map(|path| OutputFile::new(path, self.force, inputs));
         Ok(JsonFile(file.transpose()?))
     }
+
+    /// Checks the file before work on a config, whose files are inputs, too; so is the run that the config belongs to.
+    pub fn open_for(&self, path: &Path, config: &Config) -> anyhow::Result<JsonFile> {
+        let run = path.parent().filter(|folder| folder.join("run.json").exists());
+        let files = config.input_paths();
+        let inputs: Vec<&Path> = [path].into_iter().chain(run).chain(files.iter().map(PathBuf::as_path)).collect();
+        self.open(&inputs)
+    }
 }
 
 /// The file of `--json`, if one is given.

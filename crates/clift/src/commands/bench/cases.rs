@@ -18,8 +18,8 @@ use crate::output::units::{memory_size, seconds};
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let path = args.config.as_deref().unwrap_or(Path::new(""));
-    let json = timing.json.open(&[path])?;
     let config = timing.config.read(path, |_| Ok(()))?;
+    let json = timing.json.open_for(path, &config)?;
     let options = timing.options(BenchCase::ALL);
     let options = BenchOptions { error: !args.no_error, features: args.features.clone(), ..options };
     let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;

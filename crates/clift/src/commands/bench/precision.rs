@@ -21,8 +21,8 @@ pub struct BenchPrecisionArgs {
 
 pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
-    let json = timing.json.open(&[&args.config])?;
     let config = timing.config.read(&args.config, |_| Ok(()))?;
+    let json = timing.json.open_for(&args.config, &config)?;
     let report =
         compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag(Ending::WITHOUT_RESULTS)?)?;
     print_result(&report_text(&report))?;

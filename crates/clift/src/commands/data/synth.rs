@@ -37,8 +37,11 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
             "{size} is not a multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
         ));
     }
-    for &split in args.split.list() {
-        write_split(args, &config, split)?;
+    // Both splits appear together: an interrupted command leaves none.
+    let written: Vec<WrittenSplit> =
+        args.split.list().iter().map(|&split| write_split(args, &config, split)).collect::<anyhow::Result<_>>()?;
+    for split in written {
+        split.publish(args)?;
     }
     let present = |split: Split| args.out.join(split.to_string()).join("index.json").exists();
     for split in [Split::Train, Split::Test].into_iter().filter(|split| !present(*split)) {
@@ -52,9 +55,17 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     }
 }
 
-fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyhow::Result<()> {
+/// A split in a temporary folder.
+struct WrittenSplit {
+    source: SyntheticSource,
+    split: Split,
+    unfinished: PathBuf,
+    /// What was written, in words.
+    summary: String,
+}
+
+fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyhow::Result<WrittenSplit> {
     let source = SyntheticSource::new(SyntheticConfig { split, ..config.clone() })?;
-    let folder = args.out.join(split.to_string());
     let started = Instant::now();
     let mut counter = Counter::new(&split.to_string(), config.num_scenes as u64);
     let unfinished = args.out.join(format!("{TEMPORARY}{split}"));
@@ -70,24 +81,34 @@ fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyh
         Ok(record)
     });
     let num_scenes = write_chunks(&unfinished, scenes, args.chunks.target_bytes())?;
-    publish_folder(&unfinished, &folder).with_context(|| format!("writing {}", folder.display()))?;
     drop(counter);
     let (scenes, frames) = (plural(num_scenes, "scene"), plural(config.num_frames, "frame"));
     let size = format!("{}x{}", config.width, config.height);
     let (bytes, seconds) = (file_size(image_bytes), started.elapsed().as_secs_f64());
-    print_result(&format!("{split}: {scenes} of {frames}, {size}, {bytes} in {seconds:.1} s: {}", folder.display()))?;
-    if split == Split::Test {
+    let summary = format!("{split}: {scenes} of {frames}, {size}, {bytes} in {seconds:.1} s");
+    Ok(WrittenSplit { source, split, unfinished, summary })
+}
+
+impl WrittenSplit {
+    /// Renames the folder, and writes the index of a test split.
+    fn publish(self, args: &SynthArgs) -> anyhow::Result<()> {
+        let folder = args.out.join(self.split.to_string());
+        publish_folder(&self.unfinished, &folder).with_context(|| format!("writing {}", folder.display()))?;
+        print_result(&format!("{}: {}", self.summary, folder.display()))?;
+        if self.split != Split::Test {
+            return Ok(());
+        }
         let EvalConfig { num_context, num_targets, .. } = EvalConfig::default();
         let path = args.out.join(INDEX);
-        if write_evaluation_index(&path, &source, num_context, num_targets)? == 0 {
+        if write_evaluation_index(&path, &self.source, num_context, num_targets)? == 0 {
             let needed = num_context + num_targets;
-            print_warning(format!("the index has no views: {frames} are too few; use at least --frames {needed}"));
+            print_warning(format!("the index has no views: the scenes are too short; use at least --frames {needed}"));
         } else {
             let path = path.display();
             print_result(&format!("index: {num_context} contexts and {num_targets} targets per scene: {path}"))?;
         }
+        Ok(())
     }
-    Ok(())
 }
 
 fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {

@@ -70,11 +70,9 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
 }
 
 fn version() -> String {
-    let features: Vec<&str> = [DeviceName::Ndarray, DeviceName::Wgpu]
-        .into_iter()
-        .filter(|name| name.is_built())
-        .map(DeviceName::as_str)
-        .collect();
+    let devices = [DeviceName::Ndarray, DeviceName::Wgpu].into_iter().filter(|name| name.is_built());
+    let vulkan = cfg!(feature = "vulkan").then_some("vulkan");
+    let features: Vec<&str> = devices.map(DeviceName::as_str).chain(vulkan).collect();
     let features = if features.is_empty() { "none".into() } else { features.join(", ") };
     let (os, arch) = (std::env::consts::OS, std::env::consts::ARCH);
     format!("{}, cargo features: {features}, {os} {arch}", env!("CARGO_PKG_VERSION"))
