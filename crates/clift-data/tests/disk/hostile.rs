@@ -172,19 +172,21 @@ fn truncated_or_huge_colmap_models_are_refused() {
 #[test]
 fn errors_of_colmap_models_are_named() {
     // OPENCV_FISHEYE, of id 5, has more parameters than the file.
-    for (id, expected) in
-        [(99, "camera 0 of 1 has the unknown model 99"), (-1, "unknown model -1"), (5_i32, "truncated")]
-    {
+    for (id, expected) in [(99, "camera 7: the unknown model 99"), (-1, "unknown model -1"), (5_i32, "truncated")] {
         let message = patched_model(BINARY[0], 12, &id.to_le_bytes());
         assert!(message.contains(expected), "{message}");
     }
+    let unknown_first = |bytes: Vec<u8>| [&[2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 99, 0, 0, 0], &bytes[16..]].concat();
+    let message = changed("colmap_bin", BINARY[0], unknown_first).unwrap_err();
+    assert!(message.contains("camera 0 of 2 has the unknown model 99"), "{message}");
     for (file, from, to, expected) in [
         (0, "7 PINHOLE", "7 FULL_OPENCV", "camera 7: FULL_OPENCV has 4 parameters, expected 12"),
         (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected one of SIMPLE_PINHOLE, "),
-        (0, "PINHOLE 32", "PINHOLE -32", "line 4: WIDTH is \"-32\", expected a number"),
+        (0, "PINHOLE 32", "PINHOLE -32", "camera 7: line 4: WIDTH is \"-32\", expected a number"),
         (0, "PINHOLE 32 18", "PINHOLE 32 0", "camera 7: the size is 32x0 pixels"),
         (0, "32 18 28", "32 18 nan", "camera 7: bad camera: fx is NaN"),
         (0, "7 PINHOLE", "8 PINHOLE", "no camera 7"),
+        (0, "7 PINHOLE", "7 PINHOLE\n7 PINHOLE", "camera 7: its id occurs twice"),
         (1, "40 0.9833474432563557", "40 nan", "the pose holds NaN"),
         (1, "40 0.98", "40 7.98", "the quaternion has length 7.98"),
         (1, "7 left/frame 8.png", "7", "the NAME has 0 bytes"),

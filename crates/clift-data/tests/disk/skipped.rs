@@ -142,6 +142,7 @@ fn images_are_found_by_the_end_of_paths() {
         ("images/left/0.png", "C:\\Users\\somebody\\cap\\images\\left\\0.png", None),
         ("images/left_4/0.png", "/home/somebody/cap/images/left/0.png", None),
         ("0.png", "/home/somebody/cap/0.png", None),
+        ("images_4/left/0.png", "/home/somebody/photos/left/0.png", None),
         ("small/left/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
         ("small/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
         ("small/left/0.png", "images\\left\\0.png", Some("small")),
@@ -290,11 +291,14 @@ fn one_bad_item_costs_one_frame() {
 
 #[test]
 fn one_bad_camera_of_a_colmap_model_costs_its_frame() {
-    for (file, from, to, num_skipped) in [
-        ("cameras.txt", "7 PINHOLE", "9 THIN_PRISM 1 1 1\n8 PINHOLE 10 10 -nan(ind) 1 5 5\n7 PINHOLE", 0),
-        ("images.txt", "40 0.9833474432563557", "40 -nan(ind)", 1),
-        ("images.txt", "\n3.5 0 -1", "\n-nan(ind) 1.#IND -1 3.5 nan(ind) -1 7 zero -1 -nan(ind) 2 5", 0),
-        ("images.txt", "\n3.5 0 -1", "\n3 1 4 7.5 nan -1 7 3 5 -nan(ind) 2 5", 0),
+    for (file, from, to, expected) in [
+        ("cameras.txt", "7 PINHOLE", "9 THIN_PRISM 1 1 1\n8 PINHOLE 10 10 -nan(ind) 1 5 5\n7 PINHOLE", None),
+        ("cameras.txt", "7 PINHOLE", "9 PINHOLE -1 1 1\n8 PINHOLE 9.0 9 1\n6 PINHOLE\n6\nx y\n7 PINHOLE", None),
+        ("images.txt", "40 0.9833474432563557", "40 -nan(ind)", Some(("left/frame 8.png", "the pose holds NaN"))),
+        ("images.txt", "7 left/frame 8.png", "x left/frame 8.png", Some(("left/frame 8.png", "CAMERA_ID is \"x\""))),
+        ("images.txt", " 7 left/frame 8.png", "", Some(("line 5", "malformed: no CAMERA_ID"))),
+        ("images.txt", "\n3.5 0 -1", "\n-nan(ind) 1.#IND -1 3.5 nan(ind) -1 7 zero -1 -nan(ind) 2 5", None),
+        ("images.txt", "\n3.5 0 -1", "\n3 1 4 7.5 nan -1 7 3 5 -nan(ind) 2 5", None),
     ] {
         let root = copy_of_layout("colmap_txt");
         let path = root.path().join("attic/sparse/0").join(file);
@@ -303,10 +307,22 @@ fn one_bad_camera_of_a_colmap_model_costs_its_frame() {
         fs::write(&path, text.replacen(from, to, 1)).unwrap();
         let OpenedSource { source, report, .. } =
             open_test(root.path()).unwrap_or_else(|error| panic!("{to}: {error}"));
+        let num_skipped = usize::from(expected.is_some());
         assert_eq!(source.num_frames(0).unwrap() + num_skipped, 6, "{to}: {report}");
-        assert_eq!(skipped_frames(&report).len(), num_skipped, "{to}: {report}");
-        assert!(skipped_frames(&report).iter().all(|(_, reason)| reason.contains("the pose holds NaN")), "{report}");
+        let skipped = skipped_frames(&report);
+        assert_eq!(skipped.len(), num_skipped, "{to}: {report}");
+        for ((frame, reason), (name, what)) in skipped.into_iter().zip(expected) {
+            assert!(frame == name && reason.contains(what), "{to}: {report}");
+        }
     }
+    // A camera of an unknown model, which no image uses, after the others.
+    let root = copy_of_layout("colmap_bin");
+    let path = root.path().join("attic/sparse/0/cameras.bin");
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[0] += 1;
+    bytes.extend([&9_u32.to_le_bytes()[..], &77_i32.to_le_bytes(), &[1; 16], &[0; 24]].concat());
+    fs::write(&path, bytes).unwrap();
+    assert_eq!(open_test(root.path()).unwrap().source.num_frames(0).unwrap(), 6);
 }
 
 #[test]
