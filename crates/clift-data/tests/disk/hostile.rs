@@ -115,6 +115,30 @@ fn uniform_scales_of_rotations_are_divided_out_and_shears_are_refused() {
 }
 
 #[test]
+fn uniform_scales_in_re10k_text_are_divided_out() {
+    let unchanged = open_test(copy_of_layout("re10k_txt").path()).unwrap().source.cameras(0).unwrap();
+    for scale in [0.25, 100.0] {
+        let root = copy_of_layout("re10k_txt");
+        let path = root.path().join(RE10K);
+        let scaled = |(column, word): (usize, &str)| match word.parse::<f64>() {
+            Ok(number) if column >= 7 && column % 4 != 2 => (number * scale).to_string(),
+            _ => word.to_owned(),
+        };
+        let line = |line: &str| line.split(' ').enumerate().map(scaled).collect::<Vec<_>>().join(" ");
+        let text: Vec<String> = fs::read_to_string(&path).unwrap().lines().map(line).collect();
+        fs::write(&path, text.join("\n")).unwrap();
+        let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
+        assert!(report.to_string().contains("6 frames with a scaled rotation in "), "{report}");
+        for (got, expected) in source.cameras(0).unwrap().iter().zip(&unchanged) {
+            assert!(got.c2w.angle_to(expected.c2w) < 1e-7, "{got:?} {expected:?}");
+            assert!(got.c2w.translation.distance(expected.c2w.translation) < 1e-7, "{got:?} {expected:?}");
+        }
+    }
+    let sheared = replaced("re10k_txt", RE10K, " 0.940808420 0.032698628", " 3 0.032698628");
+    assert!(sheared.contains("the rotation is off an orthonormal one by"), "{sheared}");
+}
+
+#[test]
 fn rotated_images_are_skipped_for_their_aspect_ratio() {
     let root = copy_of_layout("capture");
     let image = clift_core::RgbImage { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
