@@ -319,6 +319,10 @@ fn listed_frames_are_held_out() {
     for (lists, held_out) in [
         (json!({"train_filenames": ["0.png", "3.png"], "test_filenames": ["1.png"]}), vec![1, 2]),
         (json!({"test_filenames": ["2.png"], "val_filenames": ["3.png"]}), vec![2, 3]),
+        (json!({"train_filenames": ["./0.png", ".\\3.png"], "val_filenames": []}), vec![1, 2]),
+        (json!({"train_filenames": ["lost.png"], "val_filenames": ["./2.png"]}), vec![2]),
+        (json!({"test_filenames": [null, "lost.png", "3.png"]}), vec![3]),
+        (json!({"train_filenames": ["lost.png"]}), vec![0, 2]),
         (json!({"test_filenames": []}), vec![0, 2]),
         (json!({}), vec![0, 2]),
     ] {
@@ -327,6 +331,9 @@ fn listed_frames_are_held_out() {
         transforms["frames"] = names.iter().zip([0.0, 1.0, 2.0, 3.0]).map(|(name, x)| frame_at(x, name)).collect();
         let (_root, opened) = capture(&names, &transforms);
         assert_eq!(opened.source.held_out(0, 2).unwrap(), held_out, "{lists}");
+        let has_note =
+            opened.report.to_string().contains("1 name in the lists of file names without a frame (lost.png)");
+        assert_eq!(has_note, lists.to_string().contains("lost"), "{}", opened.report);
         assert_eq!(opened.source.held_out(0, 0).unwrap(), [0; 0]);
         let training = opened.training_source(2);
         let kept: Vec<&str> = (0..4).filter(|frame| !held_out.contains(frame)).map(|frame| names[frame]).collect();

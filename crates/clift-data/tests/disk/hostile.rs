@@ -44,7 +44,11 @@ const JSON: &str = "attic/transforms.json";
 fn errors_of_transforms_json_are_named() {
     let long_name = format!("\"{}8\"", "a/".repeat(100_000));
     for (from, to, expected) in [
-        ("\"./images/8\"", long_name.as_str(), "a/a/..: its name has 200001 bytes, more than 4096"),
+        (
+            "\"./images/8\"",
+            long_name.as_str(),
+            "whose entry is malformed: its name has 200001 bytes, more than 4096 (a/a/",
+        ),
         ("\"frames\"", "\"images\"", "missing field `frames`"),
         ("\"transform_matrix\"", "\"matrix\"", "whose camera cannot be used: no transform_matrix (./images/"),
         ("\"file_path\": \"./images/8\"", "\"file_path\": 8", "invalid type: integer `8`, expected a string"),
@@ -66,7 +70,7 @@ fn errors_of_transforms_json_are_named() {
     ] {
         let message = replaced("capture", JSON, from, to);
         assert!(message.contains(expected), "{to}: {message}");
-        let is_of_one_frame = message.starts_with("1 of 1 scenes used; ") && message.contains("; 1 frame whose camera");
+        let is_of_one_frame = message.starts_with("1 of 1 scenes used; ") && message.contains("; 1 frame whose ");
         assert!(
             is_of_one_frame || message.starts_with("bad scene: ") && message.ends_with("transforms.json"),
             "{message}"
