@@ -30,7 +30,7 @@ const SMALLER: [(&str, &str); 9] = [
 ];
 
 /// Keys of a config whose training takes a second on six frames.
-const SMALL_RUN: [&str; 24] = [
+const SMALL_RUN: [&str; 25] = [
     "run_dir=trained",
     "data.width=16",
     "data.height=16",
@@ -45,6 +45,7 @@ const SMALL_RUN: [&str; 24] = [
     "clusters.grid=[0.5]",
     "clusters.num_scenes=2",
     "clusters.num_passes=1",
+    "stage1.further_sizes=[]",
     "stage1.batch_size=2",
     "stage1.accumulate=1",
     "stage2.batch_size=2",

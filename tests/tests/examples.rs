@@ -14,7 +14,7 @@ const EXAMPLES: [(&str, &[&str], &str); 6] = [
     ("fit_frame", &["16x16", "DIR/sheet.png", "DIR/fitted.png"], ""),
     ("custom_loss", &[], "step 20: loss "),
     ("encode_and_render", &["REPO/models/rooms", "DIR/photos", "DIR/scene"], "the nearest context view"),
-    ("read_scene", &["DIR/scene.clift"], "4 context views of 64 x 64"),
+    ("read_scene", &["DIR/scene.clift"], "4 context views of 128 x 128"),
 ];
 const WRITTEN: [&str; 4] = ["fitted.png", "sheet.png", "scene.clift", "scene.png"];
 
@@ -24,7 +24,7 @@ fn every_example_runs() {
     assert_eq!(names(), listed, "EXAMPLES lists every example");
     let built = Path::new(BINARY).parent().expect("a folder").join("examples");
     let place = Place::new();
-    place.clift("data synth DIR/photos --look real --scenes 1 --frames 16 --size 64x64").ok();
+    place.clift("data synth DIR/photos --look real --scenes 1 --frames 16 --size 128x128").ok();
     for (name, words, expected) in EXAMPLES {
         let binary = built.join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
         assert!(binary.is_file(), "{}: `cargo test --release --workspace` builds it", binary.display());

@@ -96,7 +96,7 @@ pub fn run_bench(
     let total = cases.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;
     let device = config.device.open()?;
-    let peak = || config.precision.peak_flops(&device);
+    let peak = || clift_model::peak_flops(&device, config.precision);
     let mut peak_flops = peak();
     let mut rows = Vec::with_capacity(cases.len());
     for case in cases {

@@ -55,6 +55,9 @@ pub struct DataConfig {
     pub num_threads: Option<usize>,
     /// Number of batches prepared ahead, at least one per thread.
     pub num_prefetch: usize,
+    /// Columns and rows that images must cover besides those of a view, for clips of several sizes.
+    #[serde(skip)]
+    pub min_size: [usize; 2],
 }
 
 impl Default for DataConfig {
@@ -77,6 +80,7 @@ impl Default for DataConfig {
             views: ViewSampler::default(),
             num_threads: None,
             num_prefetch: 4,
+            min_size: [0; 2],
         }
     }
 }

@@ -56,7 +56,7 @@ fn open_files(
         filters,
         files,
         background: config.background,
-        min_size: [config.width, config.height],
+        min_size: [config.width.max(config.min_size[0]), config.height.max(config.min_size[1])],
         image_cache: Some(config.image_cache.clone()),
         reads_chunks: false,
     };

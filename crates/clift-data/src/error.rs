@@ -55,6 +55,9 @@ pub enum DataError {
         *width as f64 / *height as f64, path = path.display()
     )]
     WrongAspect { width: usize, height: usize, camera_aspect: f64, path: PathBuf },
+    /// A mask is unreadable or has another aspect ratio than its image.
+    #[error("bad scene: bad mask: {what}: {path}", path = path.display())]
+    BadMask { what: String, path: PathBuf },
     /// A file of camera poses is malformed.
     #[error("bad poses: {what}: {path}", path = path.display())]
     BadPoses { what: String, path: PathBuf },

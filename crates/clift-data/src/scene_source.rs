@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use strum::Display;
 
 use crate::error::DataError;
-use crate::image::codec::check_image;
+use crate::image::jpeg_scan::check_image;
 
 /// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
 /// With 0 no frame is.

@@ -107,7 +107,7 @@ pub use ops::attention::{cross_sdpa, self_sdpa};
 pub use ops::cluster_attention::cluster_attention;
 pub use ops::composed::attention::MAX_SCORES;
 pub use ops::linear::{gelu_linear, linear, norm_linear};
-pub use ops::matmul::matmul_without_gradient;
+pub use ops::matmul::{matmul_without_gradient, peak_flops};
 pub use ops::optimizer::{AdamWFactors, fused_adamw, fused_gradient_norm};
 // Parameters, multiply-accumulates and memory of a network
 pub use cost::largest_tensor::{kmeans_values, largest_tensors};

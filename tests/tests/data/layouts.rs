@@ -49,14 +49,15 @@ fn captures_train_and_render_and_name_missing_frames() {
 #[test]
 fn the_program_alone_encodes_photos_renders_and_trains() {
     let place = Place::new();
-    place.clift("data synth DIR/scene --look real --scenes 1 --frames 16 --size 64x64").ok();
+    place.clift("data synth DIR/scene --look real --scenes 1 --frames 16 --size 192x192").ok();
     let alone = |words: &str| {
         let mut command = Command::new(BINARY);
         command.args(words.split(' ')).env_remove("CLIFT_MODEL").current_dir(place.at(""));
         finish(start(&mut command)).ok()
     };
     let ran = alone("encode scene --hold-out 8 -o scene.clift");
-    let ran = ran.prints("14 of 16 views in 9 groups of 64 x 64").prints("(clift, coded").notes("model: models/rooms");
+    let ran =
+        ran.prints("14 of 16 views in 9 groups of 128 x 128").prints("(clift, coded").notes("model: models/rooms");
     // Renderings of the frames beside the contexts are better than copies of the nearest.
     ran.prints("check: 2 frames held out: ").prints("; 2 rendered better");
     alone("render scene.clift --path orbit --frames 2 -o orbit")

@@ -36,9 +36,30 @@ pub fn contexts_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>>
     Some(frames)
 }
 
-/// Returns the cameras that are farther from all others than [`MAX_STEPS`] median steps between successive cameras: wrong
-/// poses of a reconstruction, which would set the scale of the scene.
+/// Returns the cameras with wrong poses of a reconstruction, which would set the scale of the scene, in order: a minority
+/// that a gap separates from the others, of [`MAX_STEPS`] median distances from the median centre, and those that are
+/// farther from all others than [`MAX_STEPS`] median steps between successive cameras.
 pub(crate) fn far_cameras(centres: &[DVec3]) -> Vec<usize> {
+    let median = |mut values: Vec<f64>| {
+        values.sort_unstable_by(f64::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or_default()
+    };
+    let middle = DVec3::from([0, 1, 2].map(|axis| median(centres.iter().map(|centre| centre[axis]).collect())));
+    let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
+    let largest_gap = MAX_STEPS * median(distances.clone());
+    let mut sorted = distances.clone();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let gap = sorted.windows(2).find(|pair| largest_gap > 0.0 && pair[1] - pair[0] > largest_gap);
+    let last = gap.map_or(f64::INFINITY, |pair| pair[0]);
+    let (near, mut far): (Vec<usize>, Vec<usize>) = (0..centres.len()).partition(|frame| distances[*frame] <= last);
+    let centres: Vec<DVec3> = near.iter().map(|frame| centres[*frame]).collect();
+    far.extend(lonely_cameras(&centres).into_iter().map(|position| near[position]));
+    far.sort_unstable();
+    far
+}
+
+/// Returns the cameras that are farther from all others than [`MAX_STEPS`] median steps.
+fn lonely_cameras(centres: &[DVec3]) -> Vec<usize> {
     let mut steps: Vec<f64> = centres.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
     let reach = |frame: usize| {
         let step = |at: Option<usize>| at.and_then(|at| steps.get(at)).copied().unwrap_or(f64::INFINITY);
@@ -87,6 +108,36 @@ mod tests {
         assert_eq!(contexts_along_path(&at(&[0.0]), 0), None);
         assert_eq!(contexts_along_path(&[], 1), None);
         assert_eq!(contexts_along_path(&at(&[0.0, f64::NAN, 1.0]), 2), Some(vec![0, 2]));
+    }
+
+    #[test]
+    fn far_cameras_are_a_separate_minority() {
+        let steady: Vec<f64> = (0..8).map(f64::from).collect();
+        let with = |changes: &[(usize, f64)]| {
+            let mut places = steady.clone();
+            for (frame, place) in changes {
+                places[*frame] = *place;
+            }
+            places
+        };
+        let rests = [[0.0; 5].as_slice(), &[0.01, 1.0, 2.0, 3.0]].concat();
+        let approach: Vec<f64> =
+            (0..40).map(|i| if i < 30 { 0.1 * f64::from(i % 10) } else { f64::from(i) - 29.0 }).collect();
+        for (places, far) in [
+            (steady.clone(), vec![]),
+            (with(&[(3, 400.0)]), vec![3]),
+            (with(&[(3, 400.0), (5, 600.0)]), vec![3, 5]),
+            (with(&[(3, 1e5), (5, 1e5), (0, -1e5)]), vec![0, 3, 5]),
+            (with(&[(2, 1e5), (3, 2e5)]), vec![2, 3]),
+            (with(&[(0, 1e5), (1, 1e5), (2, 1e5), (3, 1e5)]), vec![]),
+            (rests, vec![]),
+            (approach, vec![]),
+            (vec![0.0, 1e5], vec![]),
+            (vec![], vec![]),
+        ] {
+            let centres: Vec<DVec3> = places.iter().map(|place| *place * DVec3::X).collect();
+            assert_eq!(far_cameras(&centres), far, "{places:?}");
+        }
     }
 
     proptest! {

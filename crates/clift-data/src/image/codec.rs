@@ -12,7 +12,6 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFo
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::image::jpeg_scan::check_scans;
 
 /// Largest number of columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;
@@ -45,22 +44,15 @@ pub(crate) fn decode_with_alpha(
     Ok((rgb_image(image.into_rgb8()).map_err(|what| bad_image(key, frame, what))?, alpha))
 }
 
-/// Checks the data of a JPEG or PNG file, in a JPEG file also for damage that [`decode_image`] draws as a torn image.
-///
-/// # Errors
-/// The problem, as a sentence.
-pub(crate) fn check_image(bytes: &[u8]) -> Result<(), String> {
-    match known_format(bytes)? {
-        ImageFormat::Jpeg => check_scans(bytes).map_err(str::to_owned),
-        _ => decode(bytes).map(drop),
-    }
-}
-
 fn bad_image(key: &str, frame: usize, what: String) -> DataError {
     DataError::BadImage { key: key.to_owned(), frame, what }
 }
 
-fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
+/// Decodes a JPEG or PNG file.
+///
+/// # Errors
+/// The problem, as a sentence.
+pub(crate) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
     let mut reader = ImageReader::with_format(Cursor::new(bytes), known_format(bytes)?);
     reader.limits(limits());
     reader.decode().map_err(|error| error.to_string())
@@ -92,7 +84,7 @@ pub(crate) fn check_encoded(bytes: &[u8]) -> Result<(), String> {
 }
 
 /// Returns the format of a JPEG or PNG file with an end marker.
-fn known_format(bytes: &[u8]) -> Result<ImageFormat, String> {
+pub(crate) fn known_format(bytes: &[u8]) -> Result<ImageFormat, String> {
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
         return Err(format!("the {} bytes are neither JPEG nor PNG", bytes.len()));
     };

@@ -1,7 +1,9 @@
 //! Damage in the middle of a JPEG file. Decoders draw a torn image and report nothing; here the Huffman codes of every scan
 //! are followed without computing pixels, and must end with the data of the scan.
 
-use crate::image::codec::MAX_SIDE;
+use image::ImageFormat;
+
+use crate::image::codec::{MAX_SIDE, decode, known_format};
 
 /// Bytes between the last block of a scan and the next marker that are accepted as padding of the writer.
 const MAX_LEFT_OVER: usize = 16;
@@ -12,11 +14,22 @@ const LEFT_OVER: &str = "image data is left over after its last block";
 const BAD_CODE: &str = "the image data has an invalid code";
 const BAD_SEGMENT: &str = "a segment of the header is malformed";
 
+/// Checks the data of a JPEG or PNG file, in a JPEG file also for damage that [`decode_image`](crate::decode_image) draws as a torn image.
+///
+/// # Errors
+/// The problem, as a sentence.
+pub(crate) fn check_image(bytes: &[u8]) -> Result<(), String> {
+    match known_format(bytes)? {
+        ImageFormat::Jpeg => check_scans(bytes).map_err(str::to_owned),
+        _ => decode(bytes).map(drop),
+    }
+}
+
 /// Checks the scans of a JPEG file with Huffman codes, sequential or progressive. Other files pass.
 ///
 /// # Errors
 /// The problem, as a sentence.
-pub(crate) fn check_scans(bytes: &[u8]) -> Result<(), &'static str> {
+fn check_scans(bytes: &[u8]) -> Result<(), &'static str> {
     let mut frame = Frame::default();
     let (mut at, mut num_scans) = (0, 0);
     while let Some(marker) = next_marker(bytes, at) {

@@ -60,6 +60,18 @@ fn images_named_twice_are_used_once() {
     assert_eq!(reason, "with the image of another frame");
 }
 
+#[test]
+fn absolute_paths_that_end_alike_do_not_share_an_image() {
+    let names = ["/a/left/0.png", "/a/right/0.png", "/a/right/1.png"];
+    let root = tempfile::tempdir().unwrap();
+    fs::create_dir_all(root.path().join("images")).unwrap();
+    (0..2).for_each(|i| fs::write(root.path().join(format!("images/{i}.png")), gray(24, 16, i)).unwrap());
+    write_model(&root.path().join("sparse/0"), &names.map(|name| name.as_bytes().to_vec()));
+    let opened = open_test(root.path()).unwrap();
+    assert_eq!(opened.source.frame_names(0).unwrap(), ["0.png", "1.png"]);
+    assert_eq!(skipped_frames(&opened.report), [(names[1], "with the image of another frame")]);
+}
+
 /// Copies the COLMAP fixture with another camera model; returns its first image as stored.
 fn colmap(model: &str) -> (TempDir, RgbImage) {
     let root = copy_of_layout("colmap_txt");
@@ -198,6 +210,8 @@ fn the_largest_colmap_model_is_used() {
         (vec![("sparse/1", 8)], ""),
         (vec![("sparse/0", 3), ("sparse/1", 2), ("sparse/12", 7)], "sparse/12"),
         (vec![("sparse/0/models/0", 2), ("sparse/0/models/3", 5)], "sparse/0/models/3"),
+        (vec![("sparse/a", 2), ("sparse/b", 8)], "sparse/b with most images"),
+        (vec![("sparse/0", 5), ("sparse/run/0", 2)], "sparse/0 with most images"),
         (vec![("dense/0/sparse", 4)], ""),
         (vec![("distorted/sparse/0", 4)], ""),
         (vec![("sparse", 4), ("sparse/0", 4)], "sparse with most images"),
@@ -227,6 +241,9 @@ fn images_are_found_by_every_spelling_of_their_names() {
         ("images/left/0.png", b"images/left/0.png".to_vec()),
         ("images/left/0.png", b"/home/somebody/images/left/0.png".to_vec()),
         ("images/left/0.png", b"images\\left\\0.png".to_vec()),
+        ("images/left/0.png", b"/home/somebody/photos/left/0.png".to_vec()),
+        ("images/0.png", b"C:\\photos\\left\\0.png".to_vec()),
+        ("images/left/0.png", b"D:/photos/left/0.png".to_vec()),
         ("images/a b/0.png", b"a%20b/0.png".to_vec()),
         ("images/100%20.png", b"100%20.png".to_vec()),
         (&format!("images/{composed}.png"), b"k\xfcche.png".to_vec()),
@@ -244,7 +261,8 @@ fn images_are_found_by_every_spelling_of_their_names() {
         assert_eq!(opened.source.frame(0, 0).unwrap().rgb[0], 9, "{file} as {shown}");
         let Ok(name) = String::from_utf8(named) else { continue };
         fs::remove_dir_all(root.path().join("sparse")).unwrap();
-        let name = if name.contains("images") { name } else { format!("images/{name}") };
+        let name =
+            if ["images", "photos"].iter().any(|part| name.contains(part)) { name } else { format!("images/{name}") };
         write_capture(root.path(), &[], &json!({"fl_x": 20, "frames": [frame_at(0.0, &name)]}));
         let opened = open_test(root.path()).unwrap_or_else(|error| panic!("{file} as {name}: {error}"));
         assert_eq!(opened.source.frame(0, 0).unwrap().rgb[0], 9, "{file} as {name}");
@@ -301,6 +319,10 @@ fn listed_frames_are_held_out() {
     for (lists, held_out) in [
         (json!({"train_filenames": ["0.png", "3.png"], "test_filenames": ["1.png"]}), vec![1, 2]),
         (json!({"test_filenames": ["2.png"], "val_filenames": ["3.png"]}), vec![2, 3]),
+        (json!({"train_filenames": ["./0.png", ".\\3.png"], "val_filenames": []}), vec![1, 2]),
+        (json!({"train_filenames": ["lost.png"], "val_filenames": ["./2.png"]}), vec![2]),
+        (json!({"test_filenames": [null, "lost.png", "3.png"]}), vec![3]),
+        (json!({"train_filenames": ["lost.png"]}), vec![0, 2]),
         (json!({"test_filenames": []}), vec![0, 2]),
         (json!({}), vec![0, 2]),
     ] {
@@ -309,6 +331,9 @@ fn listed_frames_are_held_out() {
         transforms["frames"] = names.iter().zip([0.0, 1.0, 2.0, 3.0]).map(|(name, x)| frame_at(x, name)).collect();
         let (_root, opened) = capture(&names, &transforms);
         assert_eq!(opened.source.held_out(0, 2).unwrap(), held_out, "{lists}");
+        let has_note =
+            opened.report.to_string().contains("1 name in the lists of file names without a frame (lost.png)");
+        assert_eq!(has_note, lists.to_string().contains("lost"), "{}", opened.report);
         assert_eq!(opened.source.held_out(0, 0).unwrap(), [0; 0]);
         let training = opened.training_source(2);
         let kept: Vec<&str> = (0..4).filter(|frame| !held_out.contains(frame)).map(|frame| names[frame]).collect();

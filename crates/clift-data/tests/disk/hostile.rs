@@ -44,7 +44,11 @@ const JSON: &str = "attic/transforms.json";
 fn errors_of_transforms_json_are_named() {
     let long_name = format!("\"{}8\"", "a/".repeat(100_000));
     for (from, to, expected) in [
-        ("\"./images/8\"", long_name.as_str(), "a/a/..: its name has 200001 bytes, more than 4096"),
+        (
+            "\"./images/8\"",
+            long_name.as_str(),
+            "whose entry is malformed: its name has 200001 bytes, more than 4096 (a/a/",
+        ),
         ("\"frames\"", "\"images\"", "missing field `frames`"),
         ("\"transform_matrix\"", "\"matrix\"", "whose camera cannot be used: no transform_matrix (./images/"),
         ("\"file_path\": \"./images/8\"", "\"file_path\": 8", "invalid type: integer `8`, expected a string"),
@@ -66,7 +70,7 @@ fn errors_of_transforms_json_are_named() {
     ] {
         let message = replaced("capture", JSON, from, to);
         assert!(message.contains(expected), "{to}: {message}");
-        let is_of_one_frame = message.starts_with("1 of 1 scenes used; ") && message.contains("; 1 frame whose camera");
+        let is_of_one_frame = message.starts_with("1 of 1 scenes used; ") && message.contains("; 1 frame whose ");
         assert!(
             is_of_one_frame || message.starts_with("bad scene: ") && message.ends_with("transforms.json"),
             "{message}"
@@ -112,6 +116,30 @@ fn uniform_scales_of_rotations_are_divided_out_and_shears_are_refused() {
             }
         }
     }
+}
+
+#[test]
+fn uniform_scales_in_re10k_text_are_divided_out() {
+    let unchanged = open_test(copy_of_layout("re10k_txt").path()).unwrap().source.cameras(0).unwrap();
+    for scale in [0.25, 100.0] {
+        let root = copy_of_layout("re10k_txt");
+        let path = root.path().join(RE10K);
+        let scaled = |(column, word): (usize, &str)| match word.parse::<f64>() {
+            Ok(number) if column >= 7 && column % 4 != 2 => (number * scale).to_string(),
+            _ => word.to_owned(),
+        };
+        let line = |line: &str| line.split(' ').enumerate().map(scaled).collect::<Vec<_>>().join(" ");
+        let text: Vec<String> = fs::read_to_string(&path).unwrap().lines().map(line).collect();
+        fs::write(&path, text.join("\n")).unwrap();
+        let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
+        assert!(report.to_string().contains("6 frames with a scaled rotation in "), "{report}");
+        for (got, expected) in source.cameras(0).unwrap().iter().zip(&unchanged) {
+            assert!(got.c2w.angle_to(expected.c2w) < 1e-7, "{got:?} {expected:?}");
+            assert!(got.c2w.translation.distance(expected.c2w.translation) < 1e-7, "{got:?} {expected:?}");
+        }
+    }
+    let sheared = replaced("re10k_txt", RE10K, " 0.940808420 0.032698628", " 3 0.032698628");
+    assert!(sheared.contains("the rotation is off an orthonormal one by"), "{sheared}");
 }
 
 #[test]
@@ -172,19 +200,21 @@ fn truncated_or_huge_colmap_models_are_refused() {
 #[test]
 fn errors_of_colmap_models_are_named() {
     // OPENCV_FISHEYE, of id 5, has more parameters than the file.
-    for (id, expected) in
-        [(99, "camera 0 of 1 has the unknown model 99"), (-1, "unknown model -1"), (5_i32, "truncated")]
-    {
+    for (id, expected) in [(99, "camera 7: the unknown model 99"), (-1, "unknown model -1"), (5_i32, "truncated")] {
         let message = patched_model(BINARY[0], 12, &id.to_le_bytes());
         assert!(message.contains(expected), "{message}");
     }
+    let unknown_first = |bytes: Vec<u8>| [&[2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 99, 0, 0, 0], &bytes[16..]].concat();
+    let message = changed("colmap_bin", BINARY[0], unknown_first).unwrap_err();
+    assert!(message.contains("camera 0 of 2 has the unknown model 99"), "{message}");
     for (file, from, to, expected) in [
         (0, "7 PINHOLE", "7 FULL_OPENCV", "camera 7: FULL_OPENCV has 4 parameters, expected 12"),
         (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected one of SIMPLE_PINHOLE, "),
-        (0, "PINHOLE 32", "PINHOLE -32", "line 4: WIDTH is \"-32\", expected a number"),
+        (0, "PINHOLE 32", "PINHOLE -32", "camera 7: line 4: WIDTH is \"-32\", expected a number"),
         (0, "PINHOLE 32 18", "PINHOLE 32 0", "camera 7: the size is 32x0 pixels"),
         (0, "32 18 28", "32 18 nan", "camera 7: bad camera: fx is NaN"),
         (0, "7 PINHOLE", "8 PINHOLE", "no camera 7"),
+        (0, "7 PINHOLE", "7 PINHOLE\n7 PINHOLE", "camera 7: its id occurs twice"),
         (1, "40 0.9833474432563557", "40 nan", "the pose holds NaN"),
         (1, "40 0.98", "40 7.98", "the quaternion has length 7.98"),
         (1, "7 left/frame 8.png", "7", "the NAME has 0 bytes"),

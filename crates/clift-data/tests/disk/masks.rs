@@ -104,12 +104,18 @@ fn masks_of_colmap_are_turned_with_the_lens_and_bad_ones_are_named() {
     let black = |width: usize| encode_png(&RgbImage { width, height: 9, rgb: vec![0; width * 27] }).unwrap();
     fs::write(masks.join("frame 8.png.png"), black(16)).unwrap(); // of half the size
     fs::write(masks.join("frame 9.png"), black(40)).unwrap();
+    fs::write(masks.join("frame 10.png"), "no image").unwrap();
     let opened = open_test(root.path()).unwrap();
-    assert!(opened.report.to_string().contains("2 images with a mask"), "{}", opened.report);
+    let skipped = ["frame 9.png", "frame 10.png"].map(|name| (name, "whose mask cannot be used"));
+    assert_eq!(skipped_frames(&opened.report), skipped);
+    assert_eq!(opened.source.num_frames(0).unwrap(), 4);
+    assert!(opened.report.to_string().contains("1 image with a mask"), "{}", opened.report);
     let (image, coverage) = opened.source.frame_with_coverage(0, 0).unwrap();
     assert_eq!((image.rgb.iter().max(), coverage.unwrap().rgb.iter().max()), (Some(&0), Some(&0)));
-    let message = opened.source.frame(0, 1).unwrap_err().to_string();
-    assert!(message.contains("40x9 pixels, the image has 32x18") && message.ends_with("frame 9.png"), "{message}");
+    // After opening, the mask of a used frame is damaged.
+    fs::write(masks.join("frame 8.png.png"), black(40)).unwrap();
+    let message = opened.source.frame(0, 0).unwrap_err().to_string();
+    assert!(message.contains("40x9 pixels, the image has 32x18") && message.ends_with("frame 8.png.png"), "{message}");
 }
 
 #[test]

@@ -142,6 +142,7 @@ fn images_are_found_by_the_end_of_paths() {
         ("images/left/0.png", "C:\\Users\\somebody\\cap\\images\\left\\0.png", None),
         ("images/left_4/0.png", "/home/somebody/cap/images/left/0.png", None),
         ("0.png", "/home/somebody/cap/0.png", None),
+        ("images_4/left/0.png", "/home/somebody/photos/left/0.png", None),
         ("small/left/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
         ("small/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
         ("small/left/0.png", "images\\left\\0.png", Some("small")),
@@ -162,15 +163,38 @@ fn images_are_found_by_the_end_of_paths() {
     assert!(message.contains("none of 1 frames has an image; the first is images/0.png"), "{message}");
 }
 
+/// Returns a PNG with an EXIF orientation. Phones store sensor rows, with a tag for the rotation: 6 is a quarter turn
+/// clockwise, 8 the other, 3 a half turn.
+fn tagged(frame: &RgbImage, tag: u8) -> Vec<u8> {
+    let png = encode_png(frame).unwrap();
+    let exif = [&b"eXIfII*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0"[..], &[tag], &[0; 7]].concat();
+    let sum = crc32fast::hash(&exif).to_be_bytes();
+    [&png[..33], &(exif.len() as u32 - 4).to_be_bytes(), &exif, &sum, &png[33..]].concat()
+}
+
+#[test]
+fn the_principal_point_tells_the_pixels_of_the_poses() {
+    const UNDECIDED: &str = "data.files.poses_from";
+    for (tag, [cx, cy], note, size, fx) in [
+        (6, [24.5, 16.0], "turned with their cameras", [32, 48], 50.0),
+        (6, [16.0, 24.5], "as the size of the cameras requires", [32, 48], 40.0),
+        (8, [32.0, 48.0], "as the size of the cameras requires", [32, 48], 20.0),
+        (6, [20.0, 20.0], UNDECIDED, [32, 48], 50.0),
+        (3, [24.0, 16.0], UNDECIDED, [48, 32], 40.0),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        let json = json!({"fl_x": 40, "fl_y": 50, "cx": cx, "cy": cy, "frames": [frame_at(0.0, "0.png")]});
+        write_capture(root.path(), &[("0.png", tagged(&image(48, 32), tag))], &json);
+        let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
+        assert!(report.to_string().contains(note), "{cx} {cy}: {report}");
+        assert_eq!(source.image_size(0, 0).unwrap(), size, "{cx} {cy}");
+        let got = source.cameras(0).unwrap()[0].intrinsics.to_pixels(size[0], size[1]).fx;
+        assert!((got - fx).abs() < 1e-12, "{cx} {cy}: {got}");
+    }
+}
+
 #[test]
 fn views_are_turned_upright_from_the_pixels_of_the_poses() {
-    // Phones store sensor rows, with a tag for the rotation: 6 is a quarter turn clockwise, 8 the other, 3 a half turn.
-    let tagged = |frame: &RgbImage, tag: u8| {
-        let png = encode_png(frame).unwrap();
-        let exif = [&b"eXIfII*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0"[..], &[tag], &[0; 7]].concat();
-        let sum = crc32fast::hash(&exif).to_be_bytes();
-        [&png[..33], &(exif.len() as u32 - 4).to_be_bytes(), &exif, &sum, &png[33..]].concat()
-    };
     let (wide, tall, square) = ([48, 32], [32, 48], [40, 40]);
     // Stored size, tag, size of the camera, pixels of the poses: which are turned, the image alone or the view.
     for (stored, tag, camera, poses_from, turned, note) in [
@@ -254,6 +278,17 @@ fn one_bad_item_costs_one_frame() {
             camera,
         ),
         ("no matrix", Some(("transform_matrix", json!(null))), None, camera),
+        ("3 x 3 matrix", Some(("transform_matrix", json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]]))), None, "whose entry is"),
+        ("number as mask", Some(("mask_path", json!(3))), None, "whose entry is malformed: invalid type: integer `3`"),
+        (
+            "number as lens",
+            Some(("camera_model", json!(7))),
+            None,
+            "whose entry is malformed: invalid type: integer `7`",
+        ),
+        ("1e999", Some(("fl_x", json!("1e999"))), None, "whose entry is malformed: number out of range"),
+        ("no name", Some(("file_path", json!(null))), None, "whose entry is malformed: invalid type: null"),
+        ("no entry", Some(("", json!(null))), None, "whose entry is malformed: invalid type: null"),
         ("zeros", None, Some(damaged(&jpeg(90), 2500, &|_| 0)), "whose image is damaged"),
         ("noise", None, Some(damaged(&jpeg(90), 2500, &|at| (at * at / 7 % 251) as u8)), "whose image is damaged"),
         (
@@ -269,20 +304,21 @@ fn one_bad_item_costs_one_frame() {
         let images: Vec<_> = images.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
         let mut frames: Vec<Value> = (0..6).map(|frame| frame_at(frame as f64, &name(frame))).collect();
         if let Some((key, value)) = json {
-            frames[3][key] = value;
+            *(if key.is_empty() { &mut frames[3] } else { &mut frames[3][key] }) = value;
         }
         write_capture(root.path(), &images, &json!({"fl_x": 80, "cx": 48, "w": 96, "h": 64, "frames": frames}));
         // Programs write these words without quotes.
         let path = root.path().join("transforms.json");
         let mut text = fs::read_to_string(&path).unwrap();
-        for word in ["NaN", "-nan(ind)", "1.#QNAN"] {
+        for word in ["NaN", "-nan(ind)", "1.#QNAN", "1e999"] {
             text = text.replace(&format!("\"{word}\""), word);
         }
         fs::write(&path, text).unwrap();
         let OpenedSource { source, report, .. } =
             open_test(root.path()).unwrap_or_else(|error| panic!("{what}: {error}"));
         let [(frame, reason)] = skipped_frames(&report)[..] else { panic!("{what}: {report}") };
-        assert!(frame == "3.jpg" && reason.starts_with(expected), "{what}: {report}");
+        let name_of_frame = if what.starts_with("no ") && what != "no matrix" { "frames[3]" } else { "3.jpg" };
+        assert!(frame == name_of_frame && reason.starts_with(expected), "{what}: {report}");
         assert_eq!(source.frame_names(0).unwrap(), [0, 1, 2, 4, 5].map(name), "{what}");
         assert!((0..5).all(|frame| source.frame(0, frame).is_ok()), "{what}");
     }
@@ -290,11 +326,14 @@ fn one_bad_item_costs_one_frame() {
 
 #[test]
 fn one_bad_camera_of_a_colmap_model_costs_its_frame() {
-    for (file, from, to, num_skipped) in [
-        ("cameras.txt", "7 PINHOLE", "9 THIN_PRISM 1 1 1\n8 PINHOLE 10 10 -nan(ind) 1 5 5\n7 PINHOLE", 0),
-        ("images.txt", "40 0.9833474432563557", "40 -nan(ind)", 1),
-        ("images.txt", "\n3.5 0 -1", "\n-nan(ind) 1.#IND -1 3.5 nan(ind) -1 7 zero -1 -nan(ind) 2 5", 0),
-        ("images.txt", "\n3.5 0 -1", "\n3 1 4 7.5 nan -1 7 3 5 -nan(ind) 2 5", 0),
+    for (file, from, to, expected) in [
+        ("cameras.txt", "7 PINHOLE", "9 THIN_PRISM 1 1 1\n8 PINHOLE 10 10 -nan(ind) 1 5 5\n7 PINHOLE", None),
+        ("cameras.txt", "7 PINHOLE", "9 PINHOLE -1 1 1\n8 PINHOLE 9.0 9 1\n6 PINHOLE\n6\nx y\n7 PINHOLE", None),
+        ("images.txt", "40 0.9833474432563557", "40 -nan(ind)", Some(("left/frame 8.png", "the pose holds NaN"))),
+        ("images.txt", "7 left/frame 8.png", "x left/frame 8.png", Some(("left/frame 8.png", "CAMERA_ID is \"x\""))),
+        ("images.txt", " 7 left/frame 8.png", "", Some(("line 5", "malformed: no CAMERA_ID"))),
+        ("images.txt", "\n3.5 0 -1", "\n-nan(ind) 1.#IND -1 3.5 nan(ind) -1 7 zero -1 -nan(ind) 2 5", None),
+        ("images.txt", "\n3.5 0 -1", "\n3 1 4 7.5 nan -1 7 3 5 -nan(ind) 2 5", None),
     ] {
         let root = copy_of_layout("colmap_txt");
         let path = root.path().join("attic/sparse/0").join(file);
@@ -303,10 +342,22 @@ fn one_bad_camera_of_a_colmap_model_costs_its_frame() {
         fs::write(&path, text.replacen(from, to, 1)).unwrap();
         let OpenedSource { source, report, .. } =
             open_test(root.path()).unwrap_or_else(|error| panic!("{to}: {error}"));
+        let num_skipped = usize::from(expected.is_some());
         assert_eq!(source.num_frames(0).unwrap() + num_skipped, 6, "{to}: {report}");
-        assert_eq!(skipped_frames(&report).len(), num_skipped, "{to}: {report}");
-        assert!(skipped_frames(&report).iter().all(|(_, reason)| reason.contains("the pose holds NaN")), "{report}");
+        let skipped = skipped_frames(&report);
+        assert_eq!(skipped.len(), num_skipped, "{to}: {report}");
+        for ((frame, reason), (name, what)) in skipped.into_iter().zip(expected) {
+            assert!(frame == name && reason.contains(what), "{to}: {report}");
+        }
     }
+    // A camera of an unknown model, which no image uses, after the others.
+    let root = copy_of_layout("colmap_bin");
+    let path = root.path().join("attic/sparse/0/cameras.bin");
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[0] += 1;
+    bytes.extend([&9_u32.to_le_bytes()[..], &77_i32.to_le_bytes(), &[1; 16], &[0; 24]].concat());
+    fs::write(&path, bytes).unwrap();
+    assert_eq!(open_test(root.path()).unwrap().source.num_frames(0).unwrap(), 6);
 }
 
 #[test]

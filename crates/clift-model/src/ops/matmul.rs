@@ -1,6 +1,7 @@
-//! Matrix products without a backward: of cameras, in K-means and in optimizers.
+//! Matrix products without a backward: of cameras, in K-means and in optimizers. The most that a device reaches in products.
 
 use burn::tensor::{Device, Tensor};
+use clift_kernels::InstructionSet;
 
 use crate::ops::precision::Precision;
 
@@ -21,9 +22,20 @@ fn product_on_gpu<const D: usize>(precision: Precision, lhs: &Tensor<D>, rhs: &T
     Some(float_tensor(<burn::backend::Cube as Kernels>::matmul(precision, inner(lhs)?, inner(rhs)?)))
 }
 
+/// Measures the most floating-point operations per second that a device reaches: on `flex`, all threads in products that stay in
+/// registers; on a GPU, a large product. `None` for other devices, for software adapters, and for f16 on CPUs, which has no
+/// native kernels.
+pub fn peak_flops(device: &Device, precision: Precision) -> Option<f64> {
+    let device = device.clone().without_autodiff();
+    if device != Device::flex() {
+        return gpu_product_flops(precision, &device);
+    }
+    precision.native_operands().map(|operands| clift_kernels::peak_flops(InstructionSet::detected(), operands))
+}
+
 /// Measures the floating-point operations per second of large products on a GPU; `None` for other devices and software adapters.
 #[cfg(feature = "wgpu")]
-pub(crate) fn gpu_product_flops(precision: Precision, device: &Device) -> Option<f64> {
+fn gpu_product_flops(precision: Precision, device: &Device) -> Option<f64> {
     use crate::device::adapter::used_adapter;
     let is_gpu = matches!(device.as_dispatch(), burn::backend::DispatchDevice::Cube(_));
     if is_gpu && used_adapter()?.kind != "software" { product_flops(precision, device, 4096) } else { None }
@@ -31,7 +43,7 @@ pub(crate) fn gpu_product_flops(precision: Precision, device: &Device) -> Option
 
 /// Returns nothing: this build does not contain the device `wgpu`.
 #[cfg(not(feature = "wgpu"))]
-pub(crate) fn gpu_product_flops(_precision: Precision, _device: &Device) -> Option<f64> {
+fn gpu_product_flops(_precision: Precision, _device: &Device) -> Option<f64> {
     None
 }
 
@@ -61,7 +73,7 @@ mod tests {
         if std::env::var_os("CLIFT_REQUIRE_WGPU").is_none() {
             return;
         }
-        let device = crate::DeviceName::Wgpu.open().expect("an adapter");
+        let device = crate::device::name::DeviceName::Wgpu.open().expect("an adapter");
         let flops = product_flops(Precision::F32, &device, 64).expect("a rate");
         assert!((1e5..1e15).contains(&flops), "{flops}");
         assert_eq!(gpu_product_flops(Precision::F32, &Device::flex()), None);

@@ -12,13 +12,12 @@ use std::cell::Cell;
 use std::marker::PhantomData;
 
 use burn::tensor::{DType, Device, Tensor};
-use clift_kernels::{InstructionSet, OperandType, peak_flops};
+use clift_kernels::{InstructionSet, OperandType};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;
 use crate::names::{names, parse_variant};
-use crate::ops::matmul::gpu_product_flops;
 
 /// Type of the operands of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
@@ -79,17 +78,6 @@ impl Precision {
     /// elsewhere.
     pub fn for_images(device: &Device) -> Self {
         if missing_bf16(&device.clone().without_autodiff()).is_none() { Self::Bf16 } else { Self::F32 }
-    }
-
-    /// Measures the most floating-point operations per second that a device reaches: on `flex`, all threads in products that stay
-    /// in registers; on a GPU, a large product. `None` for other devices, for software adapters, and for f16 on CPUs, which has no
-    /// native kernels.
-    pub fn peak_flops(self, device: &Device) -> Option<f64> {
-        let device = device.clone().without_autodiff();
-        if device != Device::flex() {
-            return gpu_product_flops(self, &device);
-        }
-        self.native_operands().map(|operands| peak_flops(InstructionSet::detected(), operands))
     }
 
     /// Returns the operands of native kernels; `None` for f16, which has none.

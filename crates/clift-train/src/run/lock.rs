@@ -2,7 +2,7 @@
 
 use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Read, Seek, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clift_core::TEMPORARY;
 
@@ -49,19 +49,17 @@ pub(crate) fn has_other_files(folder: &Path) -> Result<bool, TrainError> {
     Ok(items.iter().any(|item| is_other(&item.file_name().to_string_lossy())))
 }
 
-/// Lock of a folder: its file `lock`, removed at the end. The operating system releases the lock when the process ends; the
-/// file of a killed process has no effect.
+/// Lock of a folder. The operating system releases the lock when the process ends; a remaining file `lock` has no
+/// effect.
 #[derive(Debug)]
 pub struct RunLock {
-    /// Locked while it is open.
     file: File,
-    path: PathBuf,
 }
 
 impl Drop for RunLock {
     fn drop(&mut self) {
+        // Removes the process id.
         let _ = self.file.set_len(0);
-        let _ = std::fs::remove_file(&self.path);
     }
 }
 
@@ -75,8 +73,6 @@ impl RunLock {
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
         let mut file = opened.map_err(TrainError::io("opening the lock of the folder", &path))?;
         match file.try_lock() {
-            // The process that had the lock removed the file meanwhile.
-            Ok(()) if !is_at(&file, &path) => return Self::take(folder, kind, sink),
             Ok(()) => {
                 // The process id is for error messages; the lock also works without it.
                 let _ = file.set_len(0).and_then(|()| write!(file, "{}", std::process::id()));
@@ -96,21 +92,6 @@ impl RunLock {
                 sink.event(&Event::Warning(text));
             }
         }
-        Ok(Self { file, path })
+        Ok(Self { file })
     }
-}
-
-/// Whether a path leads to this open file.
-#[cfg(unix)]
-fn is_at(file: &File, path: &Path) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    let id =
-        |metadata: std::io::Result<std::fs::Metadata>| metadata.ok().map(|metadata| (metadata.dev(), metadata.ino()));
-    id(file.metadata()) == id(path.metadata())
-}
-
-/// Whether a path leads to this open file: open files are not removed here.
-#[cfg(not(unix))]
-fn is_at(_file: &File, _path: &Path) -> bool {
-    true
 }

@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::{
-    ClipReader, OpenedSource, SceneSource, SceneSubset, SourceKind, Split, open_dataset, open_training_dataset,
+    ClipReader, DataConfig, OpenedSource, SceneSource, SceneSubset, SourceKind, Split, open_dataset, open_training_dataset,
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, Summary, write_skip_report};
 use clift_model::{
@@ -174,7 +174,10 @@ impl Run {
     fn open_training<'a>(&'a self, stop: &'a AtomicBool, sink: &mut dyn Sink) -> Result<Training<'a>, TrainError> {
         self.report_opening(Split::Train, sink);
         let mut progress = |done, total| sink.event(&Event::Scan { done, total });
-        let opened = open_training_dataset(&self.config.data, self.config.last_gap_step(), &mut progress)?;
+        let further = &self.config.stage1.further_sizes;
+        let min_size = [0, 1].map(|side| further.iter().map(|size| size[side]).max().unwrap_or_default());
+        let data = DataConfig { min_size, ..self.config.data.clone() };
+        let opened = open_training_dataset(&data, self.config.last_gap_step(), &mut progress)?;
         let is_divided = self.is_divided(&opened);
         let reader = self.reader(opened, Split::Train, sink)?;
         let mut validation = self.validation(Split::Test, sink)?;

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 use clift_eval::available_bytes;
+use clift_model::peak_flops;
 use clift_train::{
     BatchParts, Config, Event, Ranks, Run, RunEstimate, RunOptions, RunStep, Stage, StageSettings, estimate_run,
     memory_warning,
@@ -47,7 +48,7 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
                 estimate_run(&planned, num_ranks, *stage, *step, *step_s)
         {
             let (rate, left) = (flops_per_s / 1e9, duration(remaining_s));
-            let peak = planned.device.open().ok().and_then(|device| planned.precision.peak_flops(&device));
+            let peak = planned.device.open().ok().and_then(|device| peak_flops(&device, planned.precision));
             let share =
                 peak.map_or_else(String::new, |peak| format!(" ({:.0} % of the peak)", 100.0 * flops_per_s / peak));
             let text = format!("{rate:.0} GFLOP/s{share}; all stages and the evaluation: about {left} left");

@@ -8,6 +8,7 @@ use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
 use rayon::prelude::*;
 
 use crate::error::DataError;
+use crate::geometry::path_spread::far_cameras;
 use crate::image::codec::decode_image;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on, plural};
@@ -207,8 +208,8 @@ impl ChunkSource {
         Ok(())
     }
 
-    /// Reports unusable frames, and chunks without checksums and time stamps: of the tables in memory, and of few chunks in
-    /// any case. An unreadable chunk is an error at its use.
+    /// Reports unusable frames, scaled rotations, and chunks without checksums and time stamps: of the tables in memory, and
+    /// of few chunks in any case. Only of few chunks, far cameras. An unreadable chunk is an error at its use.
     fn note_oddities(&mut self) {
         let is_small = self.chunks.len() <= MAX_READ_CHUNKS;
         let read = |chunk: &Chunk| if is_small { ChunkTable::read(&chunk.path).ok() } else { None };
@@ -217,7 +218,7 @@ impl ChunkSource {
             self.chunks.par_iter().map(|chunk| if is_unread(chunk) { read(chunk) } else { None }).collect();
         let table_of = |chunk: usize| self.chunks[chunk].table.get().or(unread[chunk].as_ref());
         let mut report = std::mem::take(&mut self.report);
-        let (mut without_times, mut num_unchecked) = (Vec::new(), 0);
+        let (mut without_times, mut scaled, mut far, mut num_unchecked) = (Vec::new(), Vec::new(), Vec::new(), 0);
         for (index, Entry { key, chunk }) in self.scenes.iter().enumerate() {
             let table =
                 table_of(*chunk).and_then(|table| table.scenes.get(key)).filter(|table| !table.images.is_empty());
@@ -226,12 +227,21 @@ impl ChunkSource {
                 report.skip_frame(key, frame.to_string(), reason);
             }
             without_times.extend(table.filter(|table| table.timestamps.is_none()).map(|_| key.clone()));
+            scaled.extend(table.filter(|table| table.has_scale).map(|_| key.clone()));
+            let cameras =
+                table.filter(|_| is_small).and_then(|table| table.read_cameras(&self.chunks[*chunk].path).ok());
+            let centres: Vec<_> = cameras.into_iter().flatten().map(|camera| camera.c2w.translation).collect();
+            far.extend((!far_cameras(&centres).is_empty()).then(|| key.clone()));
         }
         for chunk in 0..self.chunks.len() {
             num_unchecked += usize::from(table_of(chunk).is_some_and(|table| table.lacks_checksums));
         }
         let what = "without time stamps as int64, which are counted 0, 1, ..";
         report.notes.extend(note_on(&without_times, what));
+        report.notes.extend(note_on(&scaled, "with scaled rotations, whose scale was divided out"));
+        report
+            .notes
+            .extend(note_on(&far, "with cameras far from the others, which set the scale if they are contexts"));
         if num_unchecked > 0 {
             let files = plural(num_unchecked, "file");
             report.notes.push(format!("{files} without checksums: damage would not be noticed"));

@@ -13,7 +13,7 @@ use crate::error::DataError;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 
 /// Version of the file; other versions are ignored.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// Scenes of a chunk.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -6,6 +6,7 @@ use std::path::Path;
 use clift_core::{Camera, IntrinsicsNorm, widest_fov_deg};
 
 use crate::error::DataError;
+use crate::geometry::scaled_rotation::camera_of_row;
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::pickle::Pickle;
 use crate::torch::tensor_span::tensor_span;
@@ -29,6 +30,8 @@ pub(crate) struct SceneTable {
     pub images: Vec<ByteSpan>,
     /// Frames of the file whose cameras cannot be used, in order, with the reasons.
     pub unusable: Vec<(usize, String)>,
+    /// Whether rotations had a uniform scale, which is divided out.
+    pub has_scale: bool,
     /// Largest field of view of the usable frames, in degrees; `None` for unreadable cameras.
     pub fov_deg: Option<f64>,
 }
@@ -110,8 +113,8 @@ impl Builder<'_> {
         let (cameras, camera_type) =
             tensor("cameras", &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64])?;
         let timestamps = tensor("timestamps", &[Some(num_frames)], &[ElementType::I64]).ok().map(|(span, _)| span);
-        let (key, url, unusable, fov_deg) = (key.clone(), url.to_owned(), Vec::new(), None);
-        let table = SceneTable { key, url, timestamps, cameras, camera_type, images, unusable, fov_deg };
+        let (key, url, unusable, has_scale, fov_deg) = (key.clone(), url.to_owned(), Vec::new(), false, None);
+        let table = SceneTable { key, url, timestamps, cameras, camera_type, images, unusable, has_scale, fov_deg };
         self.scenes.insert(table.key.clone(), table);
         Ok(())
     }
@@ -123,8 +126,11 @@ impl SceneTable {
         let Ok(rows) = self.read_rows(path) else { return };
         let mut cameras = Vec::with_capacity(rows.len());
         for (frame, row) in rows.into_iter().enumerate() {
-            match Camera::from_re10k(row) {
-                Ok(camera) => cameras.push(camera),
+            match camera_of_row(row) {
+                Ok((camera, scale)) => {
+                    self.has_scale |= scale.is_some();
+                    cameras.push(camera);
+                }
                 Err(error) => self.unusable.push((frame, format!("whose camera cannot be used: {error}"))),
             }
             if self.unusable.len() > MAX_UNUSABLE {
@@ -161,7 +167,7 @@ impl SceneTable {
 
     pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         let camera = |row: &[f64; 18]| {
-            Camera::from_re10k(*row).map_err(|source| DataError::BadChunk {
+            camera_of_row(*row).map(|(camera, _)| camera).map_err(|source| DataError::BadChunk {
                 what: format!("scene {}: {source}", self.key),
                 path: path.to_path_buf(),
             })

@@ -7,6 +7,9 @@ use percent_encoding::percent_decode_str;
 use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{NO_IMAGE, PhotoOptions};
 
+/// Folders of images, and of scaled copies of them.
+pub(crate) const IMAGE_FOLDERS: [&str; 4] = ["images", "images_2", "images_4", "images_8"];
+
 /// Largest number of trailing parts of an image path that are searched in the scene folder.
 const MAX_SUFFIX_PARTS: usize = 32;
 
@@ -49,8 +52,12 @@ impl<'a> ImageLocator<'a> {
         let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
             return Err(NO_IMAGE.into());
         };
+        let is_final = |found: &Result<PathBuf, String>| found.is_ok() || !is_absolute(named);
         if self.folders.has(parent) {
-            return self.folders.find(&given);
+            let found = self.folders.find(&given);
+            if is_final(&found) {
+                return found;
+            }
         }
         // Only scaled images exist, or the path belongs to another folder or computer.
         let suffixes = path_suffixes(named).map(|suffix| self.folder.join(suffix));
@@ -59,13 +66,21 @@ impl<'a> ImageLocator<'a> {
             let last = parent.file_name().unwrap_or_default().to_string_lossy();
             let scaled = ["", "_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
             if let Some(folder) = scaled.into_iter().find(|folder| self.folders.has(folder)) {
-                return self.folders.find(&folder.join(name));
+                let found = self.folders.find(&folder.join(name));
+                if is_final(&found) {
+                    return found;
+                }
             }
         }
-        if is_absolute(named) {
-            return self.folders.find(&self.folder.join(name));
+        if !is_absolute(named) {
+            return Err(NO_IMAGE.into());
         }
-        Err(NO_IMAGE.into())
+        self.folders.find(&self.folder.join(name)).or_else(|error| {
+            let folders = IMAGE_FOLDERS.map(|folder| self.folder.join(folder));
+            let folder = folders.into_iter().find(|folder| self.folders.has(folder)).ok_or_else(|| error.clone())?;
+            let below = self.longest_suffix(&folder, named);
+            self.folders.find(&folder.join(below)).map_err(|_| error)
+        })
     }
 
     /// Returns the longest suffix of a path whose parent exists in `folder`.
@@ -102,13 +117,13 @@ fn default_folder(folder: &Path, options: &PhotoOptions, folders: &mut ImageFold
 }
 
 /// Returns the suffixes of a path, from the longest (at most [`MAX_SUFFIX_PARTS`] parts) to the file name.
-fn path_suffixes(path: &Path) -> impl Iterator<Item = PathBuf> {
+pub(crate) fn path_suffixes(path: &Path) -> impl Iterator<Item = PathBuf> {
     let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
     (parts.len().saturating_sub(MAX_SUFFIX_PARTS)..parts.len()).map(move |start| parts[start..].iter().collect())
 }
 
 /// Returns whether a path is absolute, on Windows or on other systems.
-fn is_absolute(path: &Path) -> bool {
+pub(crate) fn is_absolute(path: &Path) -> bool {
     let first = path.components().next().map(|part| part.as_os_str().to_string_lossy());
     path.has_root() || first.is_some_and(|first| first.len() == 2 && first.ends_with(':'))
 }

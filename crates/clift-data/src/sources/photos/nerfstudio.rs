@@ -3,27 +3,29 @@
 //! Poses are camera to world with OpenGL axes (+x right, +y up, -z forward) and are converted to OpenCV axes.
 
 use std::collections::HashSet;
-use std::fmt;
-use std::marker::PhantomData;
 use std::path::Path;
 
-use clift_core::{DVec3, Intrinsics, IntrinsicsNorm, Pose, folder_of};
-use serde::de::{Error, SeqAccess, Visitor};
-use serde::{Deserialize, Deserializer};
+use clift_core::{Intrinsics, IntrinsicsNorm, Pose, folder_of};
+use serde::Deserialize;
+use serde_json::value::RawValue;
 
 use crate::error::DataError;
-use crate::files::bounded::{parse_json, read_bounded};
+use crate::files::bounded::read_bounded;
 use crate::files::listing::natural_order;
 use crate::geometry::lens::Lens;
+use crate::geometry::scaled_rotation::{note_on_scales, unscaled};
 use crate::image::codec::read_header;
-use crate::skip_report::plural;
+use crate::skip_report::{first_few, plural};
 use crate::sources::photos::image_locator::ImageLocator;
-use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene, unusable};
+use crate::sources::photos::loose_json::{Bounded, Number, parse, values};
+use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene, exchanges, unusable};
 
 /// Largest size of a `transforms.json`, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
 /// Longest name of an image, in bytes: the limit of operating systems for a path.
 const MAX_NAME_BYTES: usize = 4096;
+/// Largest number of characters of a text of the file in a report.
+const MAX_SHOWN_CHARS: usize = 256;
 
 /// Smallest ratio of twice the principal point to the image at which the image counts as smaller than the calibration.
 const MIN_CALIBRATED_SCALE: f64 = 1.5;
@@ -82,11 +84,14 @@ macro_rules! with_optics {
     };
 }
 
+/// A list whose items are parsed one by one.
+type Items = Bounded<Box<RawValue>, MAX_FRAMES>;
+
 with_optics!(Document {
-    frames: Bounded<Entry, MAX_FRAMES>,
-    train_filenames: Option<Bounded<String, MAX_FRAMES>>,
-    val_filenames: Option<Bounded<String, MAX_FRAMES>>,
-    test_filenames: Option<Bounded<String, MAX_FRAMES>>,
+    frames: Items,
+    train_filenames: Option<Items>,
+    val_filenames: Option<Items>,
+    test_filenames: Option<Items>,
 });
 with_optics!(Entry {
     file_path: String,
@@ -94,34 +99,79 @@ with_optics!(Entry {
     transform_matrix: Option<Bounded<[Number; 4], 4>>,
 });
 
+/// The name of a frame whose entry is malformed.
+#[derive(Deserialize)]
+struct EntryName {
+    file_path: String,
+}
+
 impl Document {
-    /// Returns which frames the file holds out of training: those that are not in `train_filenames`, or those in
-    /// `val_filenames` and `test_filenames`; `None` without such lists.
-    fn held_out(&self) -> Option<impl Fn(&str) -> bool> {
-        let names = |list: &'_ Option<Bounded<String, MAX_FRAMES>>| -> HashSet<String> {
-            list.iter().flat_map(|list| &list.0).cloned().collect()
-        };
-        let train = names(&self.train_filenames);
-        let held_out = &names(&self.val_filenames) | &names(&self.test_filenames);
-        let has_list = !(train.is_empty() && held_out.is_empty());
-        has_list
-            .then_some(move |name: &str| if train.is_empty() { held_out.contains(name) } else { !train.contains(name) })
+    /// Returns the entries in the natural order of their names, and of those that are malformed the names and reasons.
+    fn entries(&self) -> (Vec<Entry>, Vec<(String, String)>) {
+        let (mut entries, mut malformed) = (Vec::new(), Vec::new());
+        for (position, item) in self.frames.0.iter().enumerate() {
+            let what = match serde_json::from_str::<Entry>(item.get()) {
+                Ok(entry) if entry.file_path.len() <= MAX_NAME_BYTES => {
+                    entries.push(entry);
+                    continue;
+                }
+                Ok(entry) => format!("its name has {} bytes, more than {MAX_NAME_BYTES}", entry.file_path.len()),
+                // Without the place, which counts from the start of the entry.
+                Err(error) => {
+                    let what = error.to_string();
+                    what.rsplit_once(" at line ").map_or(what.as_str(), |(what, _)| what).to_owned()
+                }
+            };
+            let name = serde_json::from_str(item.get()).map(|EntryName { file_path }| file_path);
+            let name = name.unwrap_or_else(|_| format!("frames[{position}]"));
+            malformed.push((shown(&name), format!("whose entry is malformed: {}", shown(&what))));
+        }
+        entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
+        (entries, malformed)
     }
+
+    /// Returns whether each of the frames of these names is held out of training: it is not in `train_filenames`, or is in
+    /// `val_filenames` or `test_filenames`. `None` if these lists name no frame. Adds a note on names without a frame.
+    fn held_out(&self, names: &[&str], notes: &mut Vec<String>) -> Option<Vec<bool>> {
+        let names: Vec<String> = names.iter().map(|name| normal_path(name)).collect();
+        let frames: HashSet<&str> = names.iter().map(String::as_str).collect();
+        let mut unknown = Vec::new();
+        let mut listed = |lists: &[&Option<Items>]| -> HashSet<String> {
+            let items = lists.iter().copied().flatten().flat_map(|list| &list.0);
+            let listed = items.filter_map(|item| serde_json::from_str::<String>(item.get()).ok());
+            let (known, others): (Vec<_>, Vec<_>) =
+                listed.map(|name| normal_path(&name)).partition(|name| frames.contains(name.as_str()));
+            unknown.extend(others.iter().map(|name| shown(name)));
+            known.into_iter().collect()
+        };
+        let train = listed(&[&self.train_filenames]);
+        let held_out = listed(&[&self.val_filenames, &self.test_filenames]);
+        if !unknown.is_empty() {
+            let count = plural(unknown.len(), "name");
+            notes.push(format!("{count} in the lists of file names without a frame ({})", first_few(&unknown)));
+        }
+        let is_held_out =
+            |name: &String| if train.is_empty() { held_out.contains(name) } else { !train.contains(name) };
+        (!(train.is_empty() && held_out.is_empty())).then(|| names.iter().map(is_held_out).collect())
+    }
+}
+
+/// Returns the start of a text for a report.
+fn shown(text: &str) -> String {
+    text.chars().take(MAX_SHOWN_CHARS).collect()
+}
+
+/// Returns a path with the separator `/` and without `.`.
+fn normal_path(path: &str) -> String {
+    path.split(['/', '\\']).filter(|part| !["", "."].contains(part)).collect::<Vec<_>>().join("/")
 }
 
 impl Entry {
     /// Returns the camera-to-world pose, and the scale of the matrix if it was divided out.
     fn pose(&self) -> Result<(Pose, Option<f64>), String> {
         let rows = self.c2w_rows()?;
-        let error = match Pose::from_opengl(&rows) {
-            Ok(pose) => return Ok((pose, None)),
-            Err(error) => error.to_string(),
-        };
-        let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
-        let scale = x.dot(y.cross(z)).cbrt();
-        let scaled = rows.map(|[a, b, c, t]| [a / scale, b / scale, c / scale, t]);
-        let pose = Some(scale).filter(|scale| *scale > 0.0).and_then(|_| Pose::from_opengl(&scaled).ok());
-        pose.map(|pose| (pose, Some(scale))).ok_or(error)
+        let (rows, scale) = unscaled(rows);
+        Pose::from_opengl(&rows).map(|pose| (pose, scale)).map_err(|error| error.to_string())
     }
 
     /// Returns the upper three rows of the matrix; the fourth is optional.
@@ -241,6 +291,15 @@ impl<'a> Optics<'a> {
         Ok(Some([width, height]))
     }
 
+    /// Returns which size an image of `stored` pixels had when the poses were computed, stored or turned by a quarter, where
+    /// only one has the principal point near its centre.
+    fn decided_size(&self, [width, height]: [usize; 2]) -> Option<[usize; 2]> {
+        let [Some(cx), Some(cy)] = self.centre else { return None };
+        let is_near = |&[x, y]: &[usize; 2]| (cx * y as f64 / (cy * x as f64) - 1.0).abs() <= MAX_CENTRE_OFFSET;
+        let mut near = [[width, height], [height, width]].into_iter().filter(is_near);
+        near.next().filter(|_| near.next().is_none())
+    }
+
     /// Returns the size of the images to which the intrinsics apply where it is not given and images of `size` pixels are
     /// smaller: twice the principal point, as the nearest multiple of `size`.
     fn calibrated_size(&self, size: [f64; 2]) -> Option<[f64; 2]> {
@@ -276,17 +335,16 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         parse(&text).map_err(|error| bad(format!("expected the format of nerfstudio, got {error}")))?;
     drop(text);
     let folder = folder_of(path);
-    let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
-    if let Some(Entry { file_path: name, .. }) = entries.iter().find(|entry| entry.file_path.len() > MAX_NAME_BYTES) {
-        let start: String = name.chars().take(40).collect();
-        return Err(bad(format!("frame {start}..: its name has {} bytes, more than {MAX_NAME_BYTES}", name.len())));
-    }
-    entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
+    let (entries, malformed) = document.entries();
     let mut images = ImageLocator::new(folder, options);
     let (top, mut scene) = (document.optics(), PhotoScene::default());
-    let held_out = document.held_out();
-    let (mut used, mut num_scaled, mut num_guessed) = (HashSet::new(), (0, 0.0), (0, [0.0; 2]));
-    for entry in entries {
+    for (name, reason) in malformed {
+        scene.skip(name, reason);
+    }
+    let names: Vec<&str> = entries.iter().map(|entry| entry.file_path.as_str()).collect();
+    let held_out = document.held_out(&names, &mut scene.notes);
+    let (mut used, mut scales, mut num_guessed) = (HashSet::new(), Vec::new(), (0, [0.0; 2]));
+    for (position, entry) in entries.iter().enumerate() {
         let name = &entry.file_path;
         let found = images.find(name).and_then(|image| {
             if used.insert(image.clone()) { Ok(image) } else { Err("with the image of another frame".into()) }
@@ -303,20 +361,22 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
                 size
             } else {
                 let (stored, tag) = read_header(&image).map_err(|_| "whose image cannot be read".to_owned())?;
-                let size = options.size_of_poses(stored, tag).map(|side| side as f64);
+                let decided = if exchanges(tag) { optics.decided_size(stored) } else { None };
+                let size = decided.unwrap_or(options.size_of_poses(stored, tag)).map(|side| side as f64);
                 given = optics.calibrated_size(size);
                 num_guessed = given.map_or(num_guessed, |guess| (num_guessed.0 + 1, guess));
+                given = given.or(decided.map(|_| size));
                 given.unwrap_or(size)
             };
             let intrinsics_norm = optics.intrinsics_norm(size).map_err(|what| unusable(&what))?;
             let (c2w, scale) = entry.pose().map_err(|what| unusable(&what))?;
-            num_scaled = scale.map_or(num_scaled, |scale| (num_scaled.0 + 1, scale));
+            scales.extend(scale);
             let photo = Photo::new(image, c2w, intrinsics_norm, given, (lens, options.undistort));
             photo.map(|photo| Photo { mask, ..photo }).map_err(|error| unusable(&error))
         });
         match photo {
             Ok(photo) => {
-                let is_held_out = held_out.as_ref().map(|is_held_out| is_held_out(name));
+                let is_held_out = held_out.as_ref().map(|held_out| held_out[position]);
                 scene.photos.push(Photo { is_held_out, ..photo });
             }
             Err(reason) => scene.skip(name, reason),
@@ -327,14 +387,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let of = plural(scene.photos.len(), "frame");
         scene.notes.push(format!("{count} of {of} held out by the lists of file names in {}", path.display()));
     }
-    if num_scaled.0 > 0 {
-        scene.notes.push(format!(
-            "{} with a scaled rotation in {}: the scale, {:.3}, was divided out",
-            plural(num_scaled.0, "frame"),
-            path.display(),
-            num_scaled.1
-        ));
-    }
+    scene.notes.extend(note_on_scales(scales.into_iter(), path));
     if num_guessed.0 > 0 {
         let (count, [width, height]) = num_guessed;
         scene.notes.push(format!(
@@ -346,107 +399,4 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     }
     scene.num_without_camera = images.num_unrequested();
     Ok(scene)
-}
-
-/// Parses a document. Python and C++ write NaN and infinite numbers, which JSON does not have.
-fn parse(text: &[u8]) -> Result<Document, serde_json::Error> {
-    parse_json(text).or_else(|error| parse_json(&with_quoted_numbers(text).ok_or(error)?))
-}
-
-/// Returns JSON text with words such as `NaN`, `-Infinity` and `-nan(ind)` in quotes; `None` without such words.
-fn with_quoted_numbers(text: &[u8]) -> Option<Vec<u8>> {
-    let (mut quoted, mut is_string, mut at, mut has_words) = (Vec::with_capacity(text.len() + 64), false, 0, false);
-    while let Some(&byte) = text.get(at) {
-        let is_part = |byte: &u8| byte.is_ascii_alphanumeric() || b"+-.()#_".contains(byte);
-        let length = if is_string { 0 } else { text[at..].iter().take_while(|byte| is_part(byte)).count() };
-        let word = &text[at..at + length];
-        let lower = word.iter().take(16).map(u8::to_ascii_lowercase).collect::<Vec<u8>>();
-        if [&b"nan"[..], b"inf", b"#ind", b"#qnan"].iter().any(|part| lower.windows(part.len()).any(|w| w == *part)) {
-            quoted.extend([b"\"", word, b"\""].concat());
-            has_words = true;
-        } else if length > 0 {
-            quoted.extend(word);
-        } else {
-            let length = if is_string && byte == b'\\' { 2 } else { 1 };
-            is_string ^= byte == b'"';
-            quoted.extend(text[at..].iter().take(length));
-            at += length;
-        }
-        at += word.len();
-    }
-    has_words.then_some(quoted)
-}
-
-/// A number, NaN for null and for the text of [`with_quoted_numbers`].
-#[derive(Clone, Copy)]
-struct Number(f64);
-
-impl<'de> Deserialize<'de> for Number {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(NumberVisitor)
-    }
-}
-
-struct NumberVisitor;
-
-impl Visitor<'_> for NumberVisitor {
-    type Value = Number;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("a number")
-    }
-
-    fn visit_f64<E>(self, value: f64) -> Result<Number, E> {
-        Ok(Number(value))
-    }
-
-    fn visit_i64<E>(self, value: i64) -> Result<Number, E> {
-        Ok(Number(value as f64))
-    }
-
-    fn visit_u64<E>(self, value: u64) -> Result<Number, E> {
-        Ok(Number(value as f64))
-    }
-
-    fn visit_str<E: Error>(self, text: &str) -> Result<Number, E> {
-        Ok(Number(text.parse().unwrap_or(f64::NAN)))
-    }
-
-    fn visit_unit<E>(self) -> Result<Number, E> {
-        Ok(Number(f64::NAN))
-    }
-}
-
-fn values<const N: usize>(numbers: [Option<Number>; N]) -> [Option<f64>; N] {
-    numbers.map(|number| number.map(|Number(value)| value))
-}
-
-/// A list of at most `MAX` items, because parsed JSON takes up to a hundred times the memory of its text.
-struct Bounded<T, const MAX: usize>(Vec<T>);
-
-impl<'de, T: Deserialize<'de>, const MAX: usize> Deserialize<'de> for Bounded<T, MAX> {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_seq(BoundedVisitor(PhantomData))
-    }
-}
-
-struct BoundedVisitor<T, const MAX: usize>(PhantomData<T>);
-
-impl<'de, T: Deserialize<'de>, const MAX: usize> Visitor<'de> for BoundedVisitor<T, MAX> {
-    type Value = Bounded<T, MAX>;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "a list of at most {MAX}")
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
-        let mut list = Vec::new();
-        while let Some(item) = items.next_element()? {
-            if list.len() == MAX {
-                return Err(A::Error::custom(format!("a list of more than {MAX} items")));
-            }
-            list.push(item);
-        }
-        Ok(Bounded(list))
-    }
 }

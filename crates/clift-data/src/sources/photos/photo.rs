@@ -14,9 +14,10 @@ use crate::files::bounded::read_bounded;
 use crate::files::listing::decode_name;
 use crate::geometry::lens::{Lens, Projection};
 use crate::image::codec::{
-    apply_orientation, check_end, check_image, decode_image, decode_with_alpha, exif_orientation, has_alpha,
+    apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha,
     read_header,
 };
+use crate::image::jpeg_scan::check_image;
 use crate::image::lanczos::resize_lanczos;
 use crate::image::undistort::Undistortion;
 
@@ -181,11 +182,16 @@ impl Photo {
         read_bounded(&self.path, MAX_IMAGE_BYTES, "reading an image")
     }
 
-    /// Reads the header and the end of the image file, and checks the aspect ratio.
+    /// Reads header and end of the image file, and the header of its mask, and checks the aspect ratios.
     pub fn header(&self) -> Result<PhotoHeader, DataError> {
         let (stored, tag) = read_header(&self.path)?;
         let turn = self.turn(stored, tag)?;
         check_end(&self.path, MAX_IMAGE_BYTES)?;
+        if let Some(path) = &self.mask {
+            let bad = |what: String| DataError::BadMask { what, path: path.clone() };
+            let (size, _) = read_header(path).map_err(|error| bad(error.to_string()))?;
+            check_mask_size(size, stored).map_err(bad)?;
+        }
         let [width, height] = stored;
         let size = if exchanges(turn.pixels) || exchanges(turn.view) { [height, width] } else { stored };
         Ok(PhotoHeader { size, turn })
@@ -283,8 +289,15 @@ impl Photo {
 }
 
 /// Returns whether an orientation exchanges columns and rows.
-fn exchanges(orientation: Orientation) -> bool {
+pub(crate) fn exchanges(orientation: Orientation) -> bool {
     orientation.to_exif() >= 5
+}
+
+/// Checks that a mask has the aspect ratio of its image, both as columns and rows.
+fn check_mask_size(mask: [usize; 2], image: [usize; 2]) -> Result<(), String> {
+    let error = (mask[0] * image[1]) as f64 / (mask[1] * image[0]) as f64 - 1.0;
+    let what = || format!("{}x{} pixels, the image has {}x{}", mask[0], mask[1], image[0], image[1]);
+    if error.abs() > MAX_SHAPE_ERROR { Err(what()) } else { Ok(()) }
 }
 
 /// Reads the mask of an image, `[height, width]`: 0 where the file is black, 255 elsewhere. Masks may be of another size.
@@ -300,10 +313,7 @@ fn read_mask(path: &Path, image: &RgbImage, key: &str, frame: usize) -> Result<V
     mask.rgb.iter_mut().for_each(|value| *value = if *value > black { u8::MAX } else { 0 });
     let (from, to) = ([mask.width, mask.height], [image.width, image.height]);
     if from != to {
-        let error = (from[0] * to[1]) as f64 / (from[1] * to[0]) as f64 - 1.0;
-        if error.abs() > MAX_SHAPE_ERROR {
-            return Err(bad(format!("{}x{} pixels, the image has {}x{}", from[0], from[1], to[0], to[1])));
-        }
+        check_mask_size(from, to).map_err(bad)?;
         mask = resize_lanczos(&mask, to[0], to[1]);
     }
     Ok(mask.rgb.as_chunks::<3>().0.iter().map(|pixel| pixel.iter().copied().fold(0, u8::max)).collect())

@@ -24,7 +24,7 @@ const MAX_CACHED_SCENES: usize = 256;
 /// Largest number of frames named in the report; further frames are counted.
 const MAX_NAMED_FRAMES: usize = 10_000;
 
-const FAR: &str = "whose camera is farther from all others than 20 times the median step";
+const FAR: &str = "whose camera is farther away than 20 times the median step or distance";
 
 /// Images that a note counts.
 const COUNTED: [&str; 8] = [
@@ -227,6 +227,7 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
                     DataError::WrongAspect { .. } => "whose image has another aspect ratio than its camera",
                     DataError::TruncatedImage { .. } => "whose image is truncated",
                     DataError::DamagedImage { .. } => "whose image is damaged",
+                    DataError::BadMask { .. } => "whose mask cannot be used",
                     _ => "whose image cannot be read",
                 };
                 missing.push(MissingPhoto { name: names[position].clone(), reason: reason.into() });
@@ -280,7 +281,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
     counts[5] = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
-    counts[6] = photos.iter().filter(|photo| photo.mask.is_some()).count();
+    let is_masked = |(position, photo): &(usize, &Photo)| photo.mask.is_some() && !unusable.contains(position);
+    counts[6] = photos.iter().enumerate().filter(is_masked).count();
     Ok(Findings { num_frames, unusable, turns, missing, counts, notes, reason, is_checked: checks_data })
 }
 

@@ -2,10 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_core::{Camera, IntrinsicsNorm};
-
 use crate::error::DataError;
 use crate::files::bounded::{read_bounded, read_start};
+use crate::geometry::scaled_rotation::{ScaledCamera, camera_of_row, note_on_scales};
 use crate::skip_report::plural;
 use crate::sources::photos::image_folder::{images_in, numbered_images};
 use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene, unusable};
@@ -28,9 +27,11 @@ pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, 
     let (found, note) = locate(&times, &images);
     let mut scene = PhotoScene { url, ..PhotoScene::default() };
     scene.notes.extend(note.map(|note| format!("frames of {}: {note}", path.display())));
+    let scales = lines.iter().filter_map(|(_, camera)| camera.as_ref().ok()?.1);
+    scene.notes.extend(note_on_scales(scales, path));
     for ((time, camera), image) in lines.into_iter().zip(found) {
         match (image, camera) {
-            (Some(path), Ok(camera)) => {
+            (Some(path), Ok((camera, _))) => {
                 scene.photos.push(Photo { time: Some(time), ..Photo::pinhole(path.clone(), camera) });
             }
             (Some(_), Err(what)) => scene.skip(time.to_string(), unusable(&what)),
@@ -69,7 +70,7 @@ fn locate<'a>(times: &[i64], images: &'a [PathBuf]) -> (Vec<Option<&'a PathBuf>>
 }
 
 /// A time stamp with its camera, or why the camera cannot be used.
-type Line = (i64, Result<Camera<IntrinsicsNorm>, String>);
+type Line = (i64, Result<ScaledCamera, String>);
 
 /// Returns the URL and the cameras.
 fn parse(text: &str) -> Result<(String, Vec<Line>), String> {
@@ -108,7 +109,7 @@ fn parse_line(line: &str) -> Result<Line, String> {
     for (value, word) in row.iter_mut().zip(&words[1..]) {
         *value = word.parse().unwrap_or(f64::NAN);
     }
-    Ok((time, Camera::from_re10k(row).map_err(|error| error.to_string())))
+    Ok((time, camera_of_row(row).map_err(|error| error.to_string())))
 }
 
 /// Returns whether the first or second line of a text file is a camera of RealEstate10K.

@@ -185,6 +185,36 @@ fn frames_whose_cameras_cannot_be_used_are_skipped() {
     }
 }
 
+#[test]
+fn scaled_rotations_and_far_cameras_are_noted() {
+    let (folder, whole) = (tempfile::tempdir().unwrap(), re10k_mini(Split::Train));
+    let records = (0..2).map(|scene| {
+        let mut cameras = whole.cameras(scene).unwrap();
+        if scene == 0 {
+            for camera in &mut cameras {
+                camera.c2w.rotation *= 4.0;
+                camera.c2w.translation *= 4.0; // its inverse has the translation as it was
+            }
+        } else {
+            cameras[5].c2w.translation[1] = 1e5;
+        }
+        let images = (0..8).map(|frame| whole.encoded_frame(scene, frame).unwrap().unwrap()).collect();
+        let (key, timestamps) = (whole.key(scene).into(), whole.timestamps(scene).unwrap());
+        Ok(SceneRecord { key, url: String::new(), timestamps, cameras, images })
+    });
+    write_chunks(&folder.path().join("train"), records, u64::MAX).unwrap();
+    let source = ChunkSource::open(folder.path(), Split::Train, &ALL).unwrap();
+    let notes = [
+        "1 scene with scaled rotations, whose scale was divided out (00000000000000a1)",
+        "1 scene with cameras far from the others, which set the scale if they are contexts (00000000000000a2)",
+    ];
+    assert_eq!(source.report.notes, notes);
+    for (got, expected) in source.cameras(0).unwrap().iter().zip(whole.cameras(0).unwrap()) {
+        assert!(got.c2w.angle_to(expected.c2w) < 1e-5, "{got:?} {expected:?}"); // f32
+        assert!(got.c2w.translation.distance(expected.c2w.translation) < 1e-5, "{got:?} {expected:?}");
+    }
+}
+
 /// A chunk of one scene of two frames, whose time stamps and further entry are raw opcodes.
 fn odd_chunk(timestamps: &[u8], extra: &[u8]) -> Vec<u8> {
     let source = re10k_mini(Split::Train);

@@ -1,6 +1,5 @@
 //! COLMAP binary files, little-endian.
 
-use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
@@ -8,40 +7,43 @@ use std::path::Path;
 use crate::error::DataError;
 use crate::files::listing::decode_name;
 use crate::geometry::lens_models::MODELS;
-use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
+use crate::sources::photos::colmap::model::{Cameras, ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera};
 
 /// Bytes of an image point: two coordinates and the id of the 3D point.
 const POINT_BYTES: u64 = 24;
 
 /// Reads `cameras.bin` and `images.bin`.
 pub(crate) fn read(cameras: &Path, images: &Path) -> Result<Model, DataError> {
-    Ok(Model { cameras: read_cameras(cameras)?, images: read_images(images)? })
+    let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
+    read_images(images, &mut model)?;
+    Ok(model)
 }
 
-fn read_cameras(path: &Path) -> Result<HashMap<u32, ColmapCamera>, DataError> {
+fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
     let mut file = Fields::open(path)?;
     let count = u64::from_le_bytes(file.take()?);
-    let mut cameras = HashMap::new();
+    let mut cameras = Cameras::new();
     for index in 0..count {
         let id = u32::from_le_bytes(file.take()?);
         let model = i32::from_le_bytes(file.take()?);
         let (width, height) = (u64::from_le_bytes(file.take()?), u64::from_le_bytes(file.take()?));
-        let known = usize::try_from(model).ok().and_then(|model| MODELS.get(model));
-        let &(name, num_focal, num_distortion) =
-            known.ok_or_else(|| file.bad(format!("camera {index} of {count} has the unknown model {model}")))?;
-        let params = (0..num_focal + 2 + num_distortion)
-            .map(|_| file.take().map(f64::from_le_bytes))
-            .collect::<Result<_, _>>()?;
-        let camera = ColmapCamera { model: name.into(), width, height, params };
+        let camera = match usize::try_from(model).ok().and_then(|model| MODELS.get(model)) {
+            Some(&(name, num_focal, num_distortion)) => {
+                let params = (0..num_focal + 2 + num_distortion).map(|_| file.take().map(f64::from_le_bytes));
+                Ok(ColmapCamera { model: name.into(), width, height, params: params.collect::<Result<_, _>>()? })
+            }
+            None if index + 1 == count => Err(format!("the unknown model {model}")),
+            // The number of its parameters is unknown, thus where the next camera begins.
+            None => return Err(file.bad(format!("camera {index} of {count} has the unknown model {model}"))),
+        };
         add_camera(&mut cameras, id, camera).map_err(|what| file.bad(what))?;
     }
     Ok(cameras)
 }
 
-fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
+fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
     let mut file = Fields::open(path)?;
     let count = u64::from_le_bytes(file.take()?);
-    let mut images = Vec::new();
     for _ in 0..count {
         let _id: [u8; 4] = file.take()?;
         let mut w2c = [0.0; 7];
@@ -52,9 +54,9 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
         let name = file.take_name()?;
         let num_points = u64::from_le_bytes(file.take()?);
         file.skip(num_points.checked_mul(POINT_BYTES))?;
-        add_image(&mut images, ColmapImage { name, camera_id, w2c }).map_err(|what| file.bad(what))?;
+        read.add_image(Ok(ColmapImage { name, camera_id, w2c })).map_err(|what| file.bad(what))?;
     }
-    Ok(images)
+    Ok(())
 }
 
 /// Reads the number of images of `images.bin`; 0 for an unreadable file.

@@ -77,33 +77,37 @@ impl ColmapImage {
     }
 }
 
-/// Cameras by id, and images in file order.
+/// Cameras by id, or what is wrong with their entries: a camera that no image uses may be malformed.
+pub(crate) type Cameras = HashMap<u32, Result<ColmapCamera, String>>;
+
+/// Cameras, images in file order, and names and reasons of the images that are malformed.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Model {
-    pub cameras: HashMap<u32, ColmapCamera>,
+    pub cameras: Cameras,
     pub images: Vec<ColmapImage>,
+    pub malformed: Vec<(String, String)>,
 }
 
-/// Adds a camera; refuses a second one of the same id, and more than [`MAX_CAMERAS`].
-pub(crate) fn add_camera(
-    cameras: &mut HashMap<u32, ColmapCamera>,
-    id: u32,
-    camera: ColmapCamera,
-) -> Result<(), String> {
+/// Adds a camera; refuses more than [`MAX_CAMERAS`].
+pub(crate) fn add_camera(cameras: &mut Cameras, id: u32, camera: Result<ColmapCamera, String>) -> Result<(), String> {
     if cameras.len() == MAX_CAMERAS {
         return Err(format!("more than {MAX_CAMERAS} cameras"));
     }
-    match cameras.insert(id, camera) {
-        None => Ok(()),
-        Some(_) => Err(format!("camera {id} occurs twice")),
-    }
+    let twice = || Err("its id occurs twice".into());
+    cameras.entry(id).and_modify(|first| *first = twice()).or_insert(camera);
+    Ok(())
 }
 
-/// Adds an image; refuses more than [`MAX_FRAMES`].
-pub(crate) fn add_image(images: &mut Vec<ColmapImage>, image: ColmapImage) -> Result<(), String> {
-    if images.len() == MAX_FRAMES {
-        return Err(format!("more than {MAX_FRAMES} images"));
+impl Model {
+    /// Adds an image, or its name and why it is malformed; refuses more than [`MAX_FRAMES`].
+    pub fn add_image(&mut self, image: Result<ColmapImage, (String, String)>) -> Result<(), String> {
+        if self.images.len() + self.malformed.len() == MAX_FRAMES {
+            return Err(format!("more than {MAX_FRAMES} images"));
+        }
+        match image {
+            Ok(image) => self.images.push(image),
+            Err(malformed) => self.malformed.push(malformed),
+        }
+        Ok(())
     }
-    images.push(image);
-    Ok(())
 }

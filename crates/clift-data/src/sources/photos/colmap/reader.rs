@@ -1,6 +1,6 @@
 //! Captures as COLMAP models: `cameras` and `images` as `.bin` or `.txt`, with an image folder. Points are ignored.
 
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::path::{Component, Path, PathBuf};
 
 use crate::error::DataError;
@@ -8,13 +8,11 @@ use crate::files::listing::{file_names, natural_order};
 use crate::sources::photos::colmap::model::Model;
 use crate::sources::photos::colmap::{binary, text};
 use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::image_locator::first_found;
+use crate::sources::photos::image_locator::{IMAGE_FOLDERS, first_found, is_absolute, path_suffixes};
 use crate::sources::photos::photo::{Photo, PhotoOptions, PhotoScene, unusable};
 
-/// Folders of a scene that hold models, directly or in [`MODEL_FOLDERS`].
+/// Folders of a scene that hold models, directly or in other folders: `dense/0/sparse`, `sparse/0/models/1`, `sparse/a`.
 const BASES: [&str; 4] = ["sparse", "colmap", "dense", "distorted"];
-/// Names of folders between a base and its models, besides numbers: `dense/0/sparse`, `sparse/0/models/1`.
-const MODEL_FOLDERS: [&str; 4] = ["sparse", "models", "model", "dense"];
 const MAX_DEPTH: usize = 3;
 const MAX_MODELS: usize = 1000;
 
@@ -33,7 +31,7 @@ fn models_below(base: &Path) -> Vec<PathBuf> {
     let (mut found, mut folders) = (Vec::new(), VecDeque::from([(base.to_owned(), 0)]));
     while let Some((folder, depth)) = folders.pop_front() {
         let mut names = if depth < MAX_DEPTH { file_names(&folder).unwrap_or_default() } else { Vec::new() };
-        names.retain(|name| name.bytes().all(|byte| byte.is_ascii_digit()) || MODEL_FOLDERS.contains(&name.as_str()));
+        names.retain(|name| !name.starts_with("images") && folder.join(name).is_dir());
         names.sort_by(|a, b| natural_order(a, b));
         folders.extend(names.iter().map(|name| (folder.join(name), depth + 1)));
         if model_files(&folder).is_some() {
@@ -76,21 +74,26 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         return Err(DataError::BadScene { what, path: model.to_owned() });
     };
     let read = if is_binary { binary::read } else { text::read };
-    let Model { cameras, mut images } = read(&cameras_path, &images_path)?;
+    let Model { cameras, mut images, malformed } = read(&cameras_path, &images_path)?;
     images.sort_by(|a, b| natural_order(&a.name, &b.name));
     let mut folders = ImageFolders::default();
     let image_folder = find_image_folder(folder, model, options, &mut folders);
     let mut scene = PhotoScene { notes: other_models(folder, model), ..PhotoScene::default() };
-    for (index, image) in images.iter().enumerate() {
-        let found = match index.checked_sub(1).map(|before| &images[before].name) {
-            Some(before) if *before == image.name => Err("with the image of another frame".into()),
-            _ => first_found(&image.name, |name| find_image(&image_folder, name, &mut folders)),
-        };
+    for (name, reason) in malformed {
+        scene.skip(name, reason);
+    }
+    let mut used = HashSet::new();
+    for image in &images {
+        let found = first_found(&image.name, |name| find_image(&image_folder, name, &mut folders));
+        let found = found.and_then(|path| {
+            if used.insert(path.clone()) { Ok(path) } else { Err("with the image of another frame".into()) }
+        });
         let photo = found.and_then(|path| {
             let camera = cameras.get(&image.camera_id);
             let camera = camera.ok_or_else(|| unusable(&format!("no camera {}", image.camera_id)))?;
-            let optics = camera.optics().map_err(|what| unusable(&format!("camera {}: {what}", image.camera_id)));
-            let (intrinsics_norm, lens) = optics?;
+            let of_camera = |what: &String| unusable(&format!("camera {}: {what}", image.camera_id));
+            let camera = camera.as_ref().map_err(of_camera)?;
+            let (intrinsics_norm, lens) = camera.optics().map_err(|what| of_camera(&what))?;
             let size = Some([camera.width as f64, camera.height as f64]);
             let photo = |c2w| Photo::new(path, c2w, intrinsics_norm, size, (lens, options.undistort));
             image.c2w().and_then(photo).map_err(|error| unusable(&error))
@@ -104,18 +107,18 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
     Ok(scene)
 }
 
-/// Finds an image by its name in the model. Some tools write names with the image folder, `images/0.png`.
+/// Finds an image by its name in the model. Some tools write names with the image folder, `images/0.png`, and some write
+/// absolute paths, of which as many last parts count as exist.
 fn find_image(image_folder: &Path, name: &str, folders: &mut ImageFolders) -> Result<PathBuf, String> {
     let found = folders.find(&image_folder.join(name));
     found.or_else(|error| {
+        let path = Path::new(name);
         let is_folder =
             |part: &Component<'_>| part.as_os_str() == "images" || image_folder.file_name() == Some(part.as_os_str());
-        let below: PathBuf = Path::new(name).components().skip_while(|part| !is_folder(part)).skip(1).collect();
-        if below.as_os_str().is_empty() {
-            Err(error)
-        } else {
-            folders.find(&image_folder.join(below)).map_err(|_| error)
-        }
+        let below: PathBuf = path.components().skip_while(|part| !is_folder(part)).skip(1).collect();
+        let suffixes = is_absolute(path).then(|| path_suffixes(path)).into_iter().flatten();
+        let mut others = std::iter::once(below).filter(|below| !below.as_os_str().is_empty()).chain(suffixes);
+        others.find_map(|below| folders.find(&image_folder.join(below)).ok()).ok_or(error)
     })
 }
 
@@ -127,7 +130,7 @@ fn find_image_folder(folder: &Path, model: &Path, options: &PhotoOptions, folder
     }
     let names: Vec<&str> = match &options.image_folder {
         Some(name) => vec![name],
-        None => vec!["images", "images_2", "images_4", "images_8"],
+        None => IMAGE_FOLDERS.to_vec(),
     };
     let candidates = names.iter().flat_map(|name| bases.iter().map(move |base| base.join(name)));
     let found = candidates.into_iter().find(|candidate| folders.has(candidate));

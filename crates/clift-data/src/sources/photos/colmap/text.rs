@@ -1,6 +1,5 @@
 //! COLMAP text files, line by line.
 
-use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -8,40 +7,46 @@ use std::str::FromStr;
 
 use crate::error::DataError;
 use crate::files::listing::decode_name;
-use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
+use crate::sources::photos::colmap::model::{Cameras, ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera};
 
 /// Largest number of stored bytes of a line; lines of points may be longer, and their rest is skipped.
 const MAX_LINE_BYTES: usize = MAX_NAME_BYTES + 1024;
 
 /// Reads `cameras.txt` and `images.txt`.
 pub(crate) fn read(cameras: &Path, images: &Path) -> Result<Model, DataError> {
-    Ok(Model { cameras: read_cameras(cameras)?, images: read_images(images)? })
+    let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
+    read_images(images, &mut model)?;
+    Ok(model)
 }
 
-fn read_cameras(path: &Path) -> Result<HashMap<u32, ColmapCamera>, DataError> {
-    let mut cameras = HashMap::new();
+fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
+    let mut cameras = Cameras::new();
     let mut lines = Lines::open(path)?;
     while let Some(line) = lines.next_entry()? {
         let mut words = line.split_ascii_whitespace();
+        // No image can use a camera without an id.
+        let Ok(id) = number(words.next(), "CAMERA_ID") else { continue };
         let camera = (|| {
-            let id = number(words.next(), "CAMERA_ID")?;
             let model = words.next().ok_or("no MODEL")?.to_owned();
             let (width, height) = (number(words.next(), "WIDTH")?, number(words.next(), "HEIGHT")?);
-            // Programs write NaN in many ways, such as `-nan(ind)`: the camera is refused if an image uses it.
+            // Programs write NaN in many ways, such as `-nan(ind)`.
             let params = words.map(|word| word.parse().unwrap_or(f64::NAN)).collect();
-            add_camera(&mut cameras, id, ColmapCamera { model, width, height, params })
+            Ok(ColmapCamera { model, width, height, params })
         })();
-        camera.map_err(|what: String| lines.bad(&what))?;
+        let camera = camera.map_err(|what: String| format!("line {}: {what}", lines.number));
+        add_camera(&mut cameras, id, camera).map_err(|what| lines.bad(&what))?;
     }
     Ok(cameras)
 }
 
-fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
-    let mut images = Vec::new();
+fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
     let mut lines = Lines::open(path)?;
     while let Some(line) = lines.next_entry()? {
-        let image = parse_image(&line).and_then(|image| add_image(&mut images, image));
-        image.map_err(|what| lines.bad(&what))?;
+        let image = parse_image(&line).map_err(|what| {
+            let name = line.splitn(10, ' ').nth(9).map(str::to_owned);
+            (name.unwrap_or_else(|| format!("line {}", lines.number)), format!("whose line is malformed: {what}"))
+        });
+        read.add_image(image).map_err(|what| lines.bad(&what))?;
         // The line of points may be empty, but an image line in its place is an error.
         if lines.next_line()? && lines.is_of_image() {
             return Err(
@@ -49,7 +54,7 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
             );
         }
     }
-    Ok(images)
+    Ok(())
 }
 
 /// Counts the images of `images.txt`; 0 for an unreadable file.
