@@ -66,7 +66,7 @@ fn read_structs(folder: &Path, structs: &mut Structs) {
             read_structs(&path, structs);
             continue;
         }
-        let (mut doc, mut name) = (String::new(), String::new());
+        let (mut doc, mut name, mut is_skipped) = (String::new(), String::new(), false);
         for line in fs::read_to_string(&path).expect("a source file").lines() {
             if let Some(text) = line.trim_start().strip_prefix("///") {
                 doc.push_str(text);
@@ -76,8 +76,12 @@ fn read_structs(folder: &Path, structs: &mut Structs) {
             } else if let Some((field, kind)) = line.strip_prefix("    pub ").and_then(|line| line.split_once(": "))
                 && let Some((_, fields)) = structs.get_mut(&name)
             {
-                fields.push([field, kind.trim_end_matches(','), doc.trim()].map(String::from));
+                if !std::mem::take(&mut is_skipped) {
+                    fields.push([field, kind.trim_end_matches(','), doc.trim()].map(String::from));
+                }
                 doc.clear();
+            } else if line.trim() == "#[serde(skip)]" {
+                is_skipped = true;
             } else if !line.trim_start().starts_with("#[") {
                 doc.clear();
                 name = if line.starts_with('}') { String::new() } else { name };

@@ -39,11 +39,14 @@ fn scenes_are_checked_converted_and_checked_again() {
 fn an_interrupted_synth_leaves_no_split() {
     let place = Place::new();
     let synth = "data synth DIR/rooms --frames 4 --size 16x16";
-    let mut child = place.start(&format!("{synth} --scenes 100000"));
-    wait_until(&mut child, "the folder", || place.at("rooms").read_dir().is_ok_and(|mut items| items.next().is_some()));
-    signal(&child, "-INT");
-    finish(child);
-    assert_eq!(place.names("rooms"), [".clift-train"]);
+    for (scenes, unfinished) in [(100_000, vec![".clift-train"]), (4000, vec![".clift-test", ".clift-train"])] {
+        let mut child = place.start(&format!("{synth} --scenes {scenes}"));
+        let last = place.at("rooms").join(unfinished[0]);
+        wait_until(&mut child, "the folder", || last.exists());
+        signal(&child, "-INT");
+        finish(child);
+        assert_eq!(place.names("rooms"), unfinished);
+    }
     place.clift(&format!("{synth} --scenes 1")).ok();
     assert_eq!(place.names("rooms"), ["evaluation_index.json", "test", "train"]);
 }

@@ -320,6 +320,8 @@ fn outputs_replace_neither_inputs_nor_other_files() {
     for (command, input) in [
         ("plan DIR/micro.toml --json", "micro.toml"),
         ("flops DIR/micro.toml --json", "micro.toml"),
+        ("flops DIR/micro.toml --set stage1.init_from=DIR/run --json", "run/stage1/model.safetensors"),
+        ("plan DIR/run/config.toml --json", "run/run.json"),
         ("bench DIR/micro.toml --json", "micro.toml"),
         ("bench precision DIR/micro.toml --json", "micro.toml"),
         ("compare DIR/run DIR/run/eval --json", "run/eval/views.csv"),
@@ -335,5 +337,8 @@ fn outputs_replace_neither_inputs_nor_other_files() {
             .clift(&format!("{command} DIR/{input} --force"))
             .fails_with(2, &[input, " exists and belongs to the input "]);
     }
+    let one_file =
+        "encode DIR/run --scene synthetic-0-test-00000 -o DIR/new.clift --save-clusters DIR/run/../new.clift";
+    place.clift(one_file).fails_with(2, &["--save-clusters and -o name one file"]);
     assert!(files(&place.at("")) == before, "a file changed");
 }

@@ -8,7 +8,8 @@ use std::sync::atomic::AtomicBool;
 use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::{
-    ClipReader, DataConfig, OpenedSource, SceneSource, SceneSubset, SourceKind, Split, open_dataset, open_training_dataset,
+    ClipReader, DataConfig, OpenedSource, SceneSource, SceneSubset, SourceKind, Split, open_dataset,
+    open_training_dataset,
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, Summary, write_skip_report};
 use clift_model::{

@@ -14,8 +14,7 @@ use crate::files::bounded::read_bounded;
 use crate::files::listing::decode_name;
 use crate::geometry::lens::{Lens, Projection};
 use crate::image::codec::{
-    apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha,
-    read_header,
+    apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha, read_header,
 };
 use crate::image::jpeg_scan::check_image;
 use crate::image::lanczos::resize_lanczos;
