@@ -30,8 +30,7 @@ pub struct BenchReport {
     pub precision: Precision,
     /// Threads of the CPU devices.
     pub threads: usize,
-    /// Operations per second of products that stay in registers, with the operands of `precision`, measured between the
-    /// cases; `None` on other devices than `flex`.
+    /// [Peak](clift_model::peak_flops) of the device in `precision`, measured between the cases.
     pub peak_flops: Option<f64>,
     /// One row per case.
     pub rows: Vec<BenchRow>,

@@ -55,7 +55,7 @@ pub struct DataConfig {
     pub num_threads: Option<usize>,
     /// Number of batches prepared ahead, at least one per thread.
     pub num_prefetch: usize,
-    /// Columns and rows that images must cover besides those of a view, for clips of several sizes.
+    /// Smallest width and height of images, where training uses sizes larger than `width` and `height`.
     #[serde(skip)]
     pub min_size: [usize; 2],
 }

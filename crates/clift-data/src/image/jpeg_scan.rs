@@ -14,7 +14,8 @@ const LEFT_OVER: &str = "image data is left over after its last block";
 const BAD_CODE: &str = "the image data has an invalid code";
 const BAD_SEGMENT: &str = "a segment of the header is malformed";
 
-/// Checks the data of a JPEG or PNG file, in a JPEG file also for damage that [`decode_image`](crate::decode_image) draws as a torn image.
+/// Checks the data of a JPEG or PNG file, in a JPEG file also for damage that [`decode_image`](crate::decode_image) draws as a
+/// torn image.
 ///
 /// # Errors
 /// The problem, as a sentence.

@@ -20,7 +20,7 @@ use crate::weights::model_path::{check_equal_sizes, read_config};
 /// At first, the network sees the mean of every `factor` by `factor` pixels and repeats each pixel it renders as often. Rays in
 /// the frame of the camera keep the weights of directions and lose those of moments, which changes the image until it is trained.
 ///
-/// Added blocks come after those of the file. Their output layers are zero, so that they change nothing at first
+/// Added blocks follow those of the file. Their output layers are zero, so at first they change nothing
 /// ([`close_added_blocks`](Self::close_added_blocks)).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NetworkAdapter {

@@ -35,9 +35,12 @@ pub(crate) fn init_from(
     // The sizes of a weight file without a config are unknown.
     let mut adapter = NetworkAdapter::default();
     if let Ok(found) = ModelPath::find(path) {
-        adapter = NetworkAdapter::find(&config.model, &found.dir)?;
+        let found_adapter = NetworkAdapter::find(&config.model, &found.dir)?;
         if stage == Stage::Stage2 {
+            // The condenser is the same for longer patches and more blocks, and the other networks are trained.
             check_condenser(&config.model, &found.dir)?;
+        } else {
+            adapter = found_adapter;
         }
     }
     let mut loaded = load_adapted(&mut model, &part, path, adapter)?;
@@ -81,4 +84,32 @@ pub(crate) fn stage2_weights(
         "stage2: saving the weights at {position} of the way from its start; checkpoints and validations have those at its end"
     )));
     Ok(interpolate(&start, trained, *position))
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Device;
+    use clift_model::{save_weights, weights_hash};
+
+    use super::*;
+    use crate::config::parse::read_config;
+    use crate::testing::fixture;
+
+    #[test]
+    fn a_condenser_of_a_shallower_network_leaves_the_other_networks_as_trained() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mut config, _) = read_config::<Config>(&fixture("../tests/micro.toml"), &[]).expect("valid");
+        let shallow = Network::new(&config.model, 3, &Device::flex());
+        save_weights(&shallow, &folder.path().join("model.safetensors")).expect("writable");
+        let text = toml::to_string(&config).expect("a table");
+        std::fs::write(folder.path().join("config.toml"), text).expect("writable");
+        config.model.num_encoder_blocks += 1;
+        config.model.num_renderer_blocks += 1;
+        config.stage2.init_from = Some(folder.path().into());
+        let trained = Network::new(&config.model, 4, &Device::flex());
+        let mut started = init_from(trained.clone(), &config, Stage::Stage2, &mut |_: &Event| {}).expect("loads");
+        assert_eq!(weights_hash(&started.condenser), weights_hash(&shallow.condenser));
+        started.condenser = trained.condenser.clone();
+        assert_eq!(weights_hash(&started), weights_hash(&trained));
+    }
 }

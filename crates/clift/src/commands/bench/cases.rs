@@ -44,7 +44,7 @@ fn report_text(report: &BenchReport) -> String {
     let header = ["case", "median", "p95", "GFLOP/s", "peak memory", "error against f64"];
     let reduced = Some(report.precision).filter(|precision| *precision != Precision::F32);
     let products = reduced.map_or_else(String::new, |precision| format!(", {precision} products"));
-    let peak = report.peak_flops.map_or_else(String::new, |peak| format!(", {:.0} GFLOP/s in registers", peak / 1e9));
+    let peak = report.peak_flops.map_or_else(String::new, |peak| format!(", peak {:.0} GFLOP/s", peak / 1e9));
     let title = format!("{}, {} threads{products}{peak}\n", report.device, report.threads);
     let table = table(header, report.rows.iter().map(|row| cells(row, report.peak_flops)));
     [title, table].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
@@ -141,7 +141,7 @@ mod tests {
             row(BenchCase::Stage1Step, 123.4, None, Some(2e-5)),
         ];
         let expected = "\
-flex, 2 threads, 300 GFLOP/s in registers
+flex, 2 threads, peak 300 GFLOP/s
 
 case            median   p95      GFLOP/s    peak memory  error against f64
 encode          12.3 s   24.7 s   81 (27 %)  3.00 GiB     3.1e-7

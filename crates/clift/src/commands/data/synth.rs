@@ -60,7 +60,7 @@ struct WrittenSplit {
     source: SyntheticSource,
     split: Split,
     unfinished: PathBuf,
-    /// What was written, in words.
+    /// Line to print: scenes, image size and time.
     summary: String,
 }
 
