@@ -83,16 +83,12 @@ def one_line(command: list[str]) -> str | None:
 
 @dataclass
 class Measured:
-    """One process: its timed repetitions, its memory, and for K-means the inertia of every repetition."""
+    """One process: its timed repetitions and its memory."""
 
     samples: list[float]
     peak_bytes: int
-    inertia: list[float]
     foreign_cores: float
     wall_s: float
-    # Floating-point operations of a repetition, and the most a second that the processor makes in registers; ours only.
-    flops: float | None = None
-    peak_flops: float | None = None
 
 
 class Bench:
@@ -100,7 +96,6 @@ class Bench:
 
     def __init__(self, args: argparse.Namespace, python: Path, clift: Path | None, folder: Path):
         self.args, self.python, self.clift, self.folder = args, python, clift, folder
-        self.features: Path | None = args.features
         self.env = {name: str(args.threads) for name in ("RAYON_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         self.seconds_lost = 0.0
         self.probed: dict[tuple[str, str | None, str], float] = {}
@@ -119,8 +114,6 @@ class Bench:
         for override in [*overrides(size, side.is_lvsm), *side.overrides]:
             command += ["--set", override]
         command += ["--set", f"seed={round_}", "--json", str(self.folder / "ours.json"), "--force"]
-        if side.work == "kmeans":
-            command += ["--features", str(self.features_file())]
         return command
 
     def worker(self, spec: dict[str, Any]) -> list[str]:
@@ -130,20 +123,7 @@ class Bench:
         spec = dict(work=side.work, variant=variant, size=SIZES[side.size or self.args.size], precision=side.precision)
         repeats = PROBES if round_ is None else self.args.repeats
         spec |= dict(repeats=repeats, warmup=self.args.warmup)
-        if side.work == "kmeans":
-            spec |= dict(features=str(self.features_file()), seed=1000 * round_)
         return spec
-
-    def features_file(self) -> Path:
-        """What K-means clusters on both sides."""
-        if self.features is None:
-            path, size = self.folder / "features.safetensors", SIZES[self.args.size]
-            command = [str(self.python), str(HERE / "make_features.py"), str(path)]
-            for option in ("dim", "heads", "feed_forward", "contexts", "side"):
-                command += [f"--{option.replace('_', '-')}", str(size[option])]
-            quiet_machine.run([*command, "--blocks", str(size["encoder_blocks"])], self.env)
-            self.features = path
-        return self.features
 
     def measure(self, side: Side, round_: int | None, variant: str | None = None) -> Measured:
         command = self.command(side, round_, variant)
@@ -158,10 +138,7 @@ class Bench:
                 raise CommandFailed(f"no row `{side.work}` in the JSON of `{' '.join(command)}`")
             if written.get("threads", self.args.threads) != self.args.threads:
                 raise CommandFailed(f"clift used {written['threads']} threads instead of {self.args.threads}")
-        inertia = found.get("inertia") or []
-        inertia = inertia if isinstance(inertia, list) else [inertia]
-        speed = (found.get("flops"), written.get("peak_flops"))
-        return Measured(found["samples_s"], finished.peak_bytes, inertia, finished.foreign_cores, finished.wall_s, *speed)
+        return Measured(found["samples_s"], finished.peak_bytes, finished.foreign_cores, finished.wall_s)
 
     def wait(self) -> None:
         if not self.args.force:
@@ -256,14 +233,6 @@ def summarise(row: Row, rounds: list[dict[Side, Measured]], baseline_bytes: int)
         result[f"{name}_min_max_s"] = [min(samples), max(samples)] if samples else None
         result[f"{name}_bytes"] = int(statistics.median(one.peak_bytes for one in measured)) if measured else None
         result[f"{name}_samples_s"] = [one.samples for one in measured]
-        inertia = [value for one in measured for value in one.inertia]
-        if inertia:
-            result[f"{name}_inertia"] = statistics.fmean(inertia)
-    peaks = [one.peak_flops for found in rounds if (one := found.get(row.ours)) and one.flops and one.peak_flops]
-    if peaks and result["ours_s"]:
-        flops = next(one.flops for found in rounds if (one := found.get(row.ours)))
-        result["gflops"] = flops / result["ours_s"] / 1e9
-        result["share_of_peak"] = flops / result["ours_s"] / max(peaks)
     result["foreign_cores"] = max(one.foreign_cores for found in rounds for one in found.values())
     if result["ours_s"] and result["pytorch_s"]:
         ratios = [
@@ -274,8 +243,6 @@ def summarise(row: Row, rounds: list[dict[Side, Measured]], baseline_bytes: int)
         result["memory_ratio"] = result["ours_bytes"] / result["pytorch_bytes"]
         grown = result["pytorch_bytes"] - baseline_bytes
         result["memory_ratio_less_import"] = result["ours_bytes"] / grown if grown > 0 else None
-    if "ours_inertia" in result and "pytorch_inertia" in result:
-        result["inertia_ratio"] = result["ours_inertia"] / result["pytorch_inertia"]
     return result
 
 
@@ -304,7 +271,7 @@ def gigabytes(value: int | None) -> str:
 
 
 def table(results: list[dict[str, Any]], targets: bool) -> str:
-    head = ["work", "ours", "GFLOP/s (of peak)", "PyTorch", "ratio (rounds)", "ours", "PyTorch", "ratio"]
+    head = ["work", "ours", "PyTorch", "ratio (rounds)", "ours", "PyTorch", "ratio"]
     head += ["target"] * targets
     lines = [head, ["---"] * len(head)]
     for result in results:
@@ -316,16 +283,14 @@ def table(results: list[dict[str, Any]], targets: bool) -> str:
             low, high = result["ratio_spread"]
             ratio = f"{result['ratio']:.3f} ({low:.3f} .. {high:.3f})"
         memory = f"{result['memory_ratio']:.2f}" if "memory_ratio" in result else "-"
-        speed = f"{result['gflops']:.0f} ({result['share_of_peak']:.0%})" if "gflops" in result else "-"
-        line = [result["work"], seconds(result["ours_s"]), speed, seconds(result["pytorch_s"]), ratio]
+        line = [result["work"], seconds(result["ours_s"]), seconds(result["pytorch_s"]), ratio]
         line += [gigabytes(result["ours_bytes"]), gigabytes(result["pytorch_bytes"]), memory]
         if targets:
-            names = {"ratio": "time", "memory_ratio": "memory", "ours_bytes": "bytes", "inertia_ratio": "inertia"}
+            names = {"ratio": "time", "memory_ratio": "memory", "ours_bytes": "bytes"}
             texts = []
             for name, target in result.get("targets", {}).items():
                 most, verdict = target["at_most"], "met" if target["met"] else "**missed**"
-                value = f" ({result[name]:.4f})" if name == "inertia_ratio" else ""
-                texts.append(f"{names[name]} <= {gigabytes(most) if name == 'ours_bytes' else most}: {verdict}{value}")
+                texts.append(f"{names[name]} <= {gigabytes(most) if name == 'ours_bytes' else most}: {verdict}")
             line.append("; ".join(texts) or "-")
         lines.append(line)
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -346,7 +311,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--targets", action="store_true", help="print each target and whether it is met (full size)")
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a target is missed")
     parser.add_argument("--pytorch-only", action="store_true", help="measure PyTorch alone")
-    parser.add_argument("--features", type=Path, metavar="F", help="what K-means clusters (see make_features.py)")
     parser.add_argument("--config", type=Path, default=ROOT / "configs" / "tiny.toml", help="sizes are set over it")
     parser.add_argument("--clift", type=Path, metavar="EXE", help="default: cargo build --release")
     parser.add_argument("--python", type=Path, metavar="EXE", help="default: that of --venv")
@@ -365,7 +329,7 @@ def parse_arguments() -> argparse.Namespace:
             parser.error(f"no work `{name}`; there are {' '.join(names)}")
     if min(args.rounds, args.repeats, args.threads) < 1 or args.warmup < 0:
         parser.error("rounds, repeats and threads are at least 1, warmup at least 0")
-    for path in (args.features, args.config, args.clift, args.python):
+    for path in (args.config, args.clift, args.python):
         if path is not None and not path.exists():
             parser.error(f"{path} does not exist")
     return args
@@ -401,7 +365,6 @@ def measure_all(args: argparse.Namespace, folder: Path, report: dict[str, Any]) 
     report["versions"] = {"python": platform.python_version(), **known["versions"]}
     report["versions"]["clift"] = one_line([str(clift), "--version"]) if clift else None
     report["versions"]["commit"] = one_line(["git", "describe", "--always", "--dirty"])
-    report["features"] = str(args.features) if args.features else "seeded encoder on smooth noise"
 
     selected = [row for row in rows() if row.work in args.work and not (args.pytorch_only and row.torch is None)]
     for name in dict.fromkeys(row.group for row in selected):

@@ -1,6 +1,6 @@
 """The sweep of a GPU: clift's kernels and whole updates beside PyTorch, within a few minutes. gpu_bench.sh packs and runs it.
 
-Four parts: `clift doctor`; every candidate tile of every own kernel (crates/clift-cube/examples/sweep); updates,
+Four parts: `clift doctor`; every candidate tile of the products and attentions (crates/clift-cube/examples/sweep); updates,
 encoding and rendering of the paper's network beside PyTorch (the twin in clift_torch.py, with fused attention and AdamW);
 steps of configs/re10k.toml. Every measurement is a process of its own with a time limit, and is in the JSON file as soon
 as it ends (candidates: as soon as each ends). The time that a part leaves is for the next ones. `clift` compiles kernels to

@@ -32,7 +32,7 @@ def optimizer(**changes: object) -> str:
     return "stage1.optimizer={" + ", ".join(f"{key}={json.dumps(value)}" for key, value in values.items()) + "}"
 
 
-PLUCKER, GTA, PROPE = (f'model.camera_encoding="{name}"' for name in ("plucker", "gta", "prope"))
+PLUCKER, GTA = (f'model.camera_encoding="{name}"' for name in ("plucker", "gta"))
 PATCH_4, PATCH_8 = "model.patch_size=4", "model.patch_size=8"
 ADAMW, MUON = optimizer(), optimizer(algorithm="muon", learning_rate=6e-3)
 FULL_SIZE = "stage1.half_resolution=0"
@@ -45,7 +45,6 @@ TRAINED = {
     "patch of 4, gta": [PATCH_4, GTA, ADAMW, FULL_SIZE],
     "patch of 4, Muon": [PATCH_4, PLUCKER, MUON, FULL_SIZE],
     "patch of 4, Muon, gta": [PATCH_4, GTA, MUON, FULL_SIZE],
-    "patch of 4, Muon, prope": [PATCH_4, PROPE, MUON, FULL_SIZE],
     "whole, no half resolution": [FULL_SIZE],
     "whole": [],
     "whole, 5 targets a scene": ["data.views.num_targets=5"],

@@ -388,27 +388,10 @@ WORKS: dict[str, tuple[Callable[[Size, str], Work], list[str]]] = {
 # ----------------------------------------------------------------- worker
 
 
-def kmeans(features: str, num_repeats: int, seed: int) -> dict[str, list[float]]:
-    """scikit-learn's K-means as it comes (k-means++, one start), N / 4 clusters, another seed each time."""
-    from safetensors.numpy import load_file
-    from sklearn.cluster import KMeans
-
-    tokens = load_file(features)["features"]
-    start_peak()
-    samples, inertia = [], []
-    for repeat in range(num_repeats):
-        start = time.perf_counter()
-        fit = KMeans(len(tokens) // 4, random_state=seed + repeat).fit(tokens)
-        samples.append(time.perf_counter() - start)
-        inertia.append(float(fit.inertia_))
-    return {"samples_s": samples, "inertia": inertia}
-
-
 def versions() -> dict[str, str]:
     import numpy
-    import sklearn
 
-    return {"torch": torch.__version__, "numpy": numpy.__version__, "scikit-learn": sklearn.__version__}
+    return {"torch": torch.__version__, "numpy": numpy.__version__}
 
 
 def start_peak() -> None:
@@ -484,8 +467,6 @@ def main() -> None:
     elif spec["work"] == "versions":
         variants = {name: variants for name, (_, variants) in WORKS.items()}
         result = {"versions": versions(), "variants": variants}
-    elif spec["work"] == "kmeans":
-        result = kmeans(spec["features"], spec["repeats"], spec["seed"])
     else:
         make, _ = WORKS[spec["work"]]
         with autocast("cpu", spec["precision"]):

@@ -3,7 +3,7 @@
 #   bash scripts/check/attack.sh [SECONDS] [more arguments of clift-attack: --seed 3, --target pickle]
 #
 # What is found lies in findings/ afterwards, and the command that shows it again is
-#   clift-attack --target NAME --seed SEED --first NUMBER --count 1
+#   clift-attack --target NAME --seed SEED --first NUMBER
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 seconds=${1:-600}

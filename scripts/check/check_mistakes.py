@@ -2,9 +2,9 @@
 
     python3 scripts/check/check_mistakes.py DIR.. [--clift target/release/clift] [--repeats 3] [--json FILE]
 
-Converts every scene of the folders to a file of its own in a temporary folder, changes the cameras there, and calls
-`clift data check`. Scenes that are not ok unchanged are listed and left out. Prints a table of every mistake: scenes
-flagged, scenes whose reason names the mistake (of a single camera: its frame), and the scenes missed. Needs no package.
+Writes every scene of the chunks in the folders to a file of its own in a temporary folder, changes the cameras there, and
+calls `clift data check`. Scenes that are not ok unchanged are listed and left out. Prints a table of every mistake: scenes
+flagged, scenes whose reason names the mistake (of a single camera: its frame), and the scenes missed. Needs PyTorch.
 """
 
 import argparse
@@ -20,6 +20,8 @@ import sys
 import tempfile
 import zipfile
 from pathlib import Path
+
+import torch
 
 OPPOSITE_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
 
@@ -210,13 +212,10 @@ def main():
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary)
         for number, folder in enumerate(args.folders):
-            packed = root / f"packed{number}"
-            done = run(args.clift, "data", "convert", folder, packed, "--to", "scenes", "--quality", 95)
-            if done.returncode != 0:
-                sys.exit(f"clift data convert {folder} failed: {done.stderr}")
             (root / f"good/{number}").mkdir(parents=True)
-            for path in packed.glob("*/*.torch"):
-                path.rename(root / f"good/{number}" / path.name)
+            for path in folder.glob("**/*.torch"):
+                for scene in torch.load(path, weights_only=True):
+                    torch.save(scene, root / f"good/{number}" / f"{scene['key']}.torch")
         good = checked(args.clift, root / "good")
         for row in good.values():
             px = row["epipolar_px"]

@@ -37,7 +37,7 @@ SETTINGS = [
     "stage1={steps=60, batch_size=4, optimizer={learning_rate=1e-3, warm_up_steps=5}}",
     "clusters={grid=['1/4', 1.0], num_passes=2, num_scenes=24}",
     "stage2={steps=50, batch_size=4, optimizer={learning_rate=1e-3, warm_up_steps=5}}",
-    "checkpoint={every=2, keep=2, keep_every=20}",
+    "checkpoint={every=2, keep=2}",
     "eval={stored_tokens=['1/4', 1.0], num_scenes=4, every=10, validation_stored_tokens='1/4', num_validation_scenes=2}",
 ]
 

@@ -9,15 +9,10 @@ released code. Modules carry the names that the checkpoints' keys have below
 
 Variants: `released-re10k`, `released-dl3dv` (adds `input_norm` and the q_norm, k_norm
 of every attention in encoder and decoder; the squeezer has none), and `paper`, whose condenser is clift_torch's, below `squeezer.blocks`.
-
-    python scripts/twin/clift_released.py FILE            # loads an export strictly and prints its sizes
-    python scripts/twin/clift_released.py FILE --same-as FIXTURE.ckpt   # and compares every value
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import dataclass
 
 import torch
@@ -231,81 +226,3 @@ class ReleasedClift(nn.Module):
             patches = last[1](apply(last[0], self.output_norm(x)))
             pictures.append(twin.unpatchify(patches, height, width))
         return torch.cat(pictures, 1)
-
-
-def config_of(state: dict[str, Tensor], num_heads: int | None = None) -> ReleasedConfig:
-    """Reads the sizes off the keys and shapes of a state dict; heads cannot be read where there is no QK-norm."""
-
-    def count(prefix: str) -> int:
-        return len({key[len(prefix) :].split(".")[0] for key in state if key.startswith(prefix)})
-
-    dim = state["output_norm.weight"].shape[0]
-    paper_blocks = count("squeezer.blocks.")
-    has_norms = "input_norm.weight" in state
-    if has_norms:
-        num_heads = dim // state["encoder.layers.0.self_attn.q_norm.weight"].shape[0]
-    projections = ("linear_input", "linear_target", "patch_to_image.0")
-    return ReleasedConfig(
-        variant="paper" if paper_blocks else "released-dl3dv" if has_norms else "released-re10k",
-        dim=dim,
-        num_heads=num_heads or 8,
-        feed_forward_dim=state["encoder.layers.0.linear1.weight"].shape[0],
-        num_encoder_blocks=count("encoder.layers."),
-        num_renderer_blocks=count("decoder.layers."),
-        num_condenser_blocks=paper_blocks or 2,
-        condenser_residual=not paper_blocks or "squeezer.blocks.0.norm_cross.weight" in state,
-        condenser=any(key.startswith("squeezer.") for key in state),
-        convolutions=tuple(name for name in projections if state[f"{name}.weight"].dim() == 4),
-    )
-
-
-def read(path: str) -> dict[str, Tensor]:
-    """The network's keys of a checkpoint or an export, without their prefix."""
-    if path.endswith(".safetensors"):
-        from safetensors.torch import load_file
-
-        state = load_file(path)
-    else:
-        state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-    return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
-
-
-def said_heads(path: str) -> int | None:
-    """The number of heads in an export."""
-    if path.endswith(".safetensors"):
-        from safetensors import safe_open
-
-        with safe_open(path, "pt") as file:
-            sizes = file.metadata() or {}
-    else:
-        sizes = torch.load(path, map_location="cpu", weights_only=True).get("clift", {})
-    return int(sizes["num_heads"]) if "num_heads" in sizes else None
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description="Loads an export into the PyTorch twin, strictly.")
-    parser.add_argument("file", help="what `clift export` wrote")
-    parser.add_argument("--num-heads", type=int, help="number of heads, where neither a shape nor the file holds it")
-    parser.add_argument("--same-as", help="a checkpoint whose every value must be the same, bit for bit")
-    args = parser.parse_args()
-    state = read(args.file)
-    config = config_of(state, args.num_heads or said_heads(args.file))
-    model = ReleasedClift(config)
-    model.load_state_dict(state, strict=True)
-    print(f"{args.file}: {len(state)} tensors, {sum(t.numel() for t in state.values())} values, {config}")
-    if args.same_as:
-        import pickle_stand_ins
-
-        other = pickle_stand_ins.read(args.same_as)
-        names = {key.removeprefix(PREFIX) for key in other if key.startswith(PREFIX)}
-        if names != state.keys():
-            print(f"keys differ: {sorted(names ^ state.keys())}")
-            return 1
-        wrong = [key for key in names if not torch.equal(state[key], other[PREFIX + key])]
-        print(f"differ: {wrong}" if wrong else f"all equal those of {args.same_as}")
-        return 1 if wrong else 0
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

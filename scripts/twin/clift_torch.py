@@ -126,25 +126,17 @@ class FeedForward(nn.Module):
 # ------------------------------------------------ camera-relative attention
 
 
-def token_matrices(
-    encoding: str, intrinsics: Tensor, c2w: Tensor, height: int, width: int, head_dim: int
-) -> Tensor:
-    """The matrix `rho` of every patch as a dense matrix, `[B, V*h*w, E, E]` (GTA, PRoPE).
+def token_matrices(intrinsics: Tensor, c2w: Tensor, height: int, width: int, head_dim: int) -> Tensor:
+    """The matrix `rho` of every patch as a dense matrix, `[B, V*h*w, E, E]` (GTA).
 
     Channel `j*E/8 + k` of a head is coordinate j of the k-th 4-vector, on which the
-    world-to-camera matrix acts (`prope`: times the intrinsics in units of the image
-    size, principal point relative to the centre). Channels `E/2 + p` and `3E/4 + p`
+    world-to-camera matrix acts. Channels `E/2 + p` and `3E/4 + p`
     are a pair that turns by the angle p: E/8 of them by the row, E/8 by the column of
     the patch's centre, in patches from the principal point.
     """
     rows, columns, count = height // PATCH_SIZE, width // PATCH_SIZE, head_dim // 8
     batch, views = c2w.shape[:2]
     g = torch.linalg.inv(c2w)
-    if encoding == "prope":
-        lens = torch.eye(4, dtype=c2w.dtype).repeat(batch, views, 1, 1)
-        lens[..., 0, 0], lens[..., 1, 1] = intrinsics[..., 0] / width, intrinsics[..., 1] / height
-        lens[..., 0, 2], lens[..., 1, 2] = intrinsics[..., 2] / width - 0.5, intrinsics[..., 3] / height - 0.5
-        g = lens @ g
     rho = torch.zeros(batch, views, rows, columns, head_dim, head_dim, dtype=c2w.dtype)
     for i in range(4):
         for j in range(4):

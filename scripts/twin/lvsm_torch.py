@@ -20,11 +20,7 @@ from torch import Tensor
 
 @dataclass
 class LvsmConfig:
-    """Sizes of the network; the defaults are LVSM's, with the six blocks each of the CLiFT paper.
-
-    `stock=True` is the network in CLiFT's release: stock pre-norm blocks with biases,
-    colours in [0, 1], and a norm of the latents alone before the decoder.
-    """
+    """Sizes of the network; the defaults are LVSM's, with the six blocks each of the CLiFT paper."""
 
     dim: int = 768
     num_heads: int = 12
@@ -32,7 +28,6 @@ class LvsmConfig:
     num_encoder_blocks: int = 6
     num_renderer_blocks: int = 6
     num_latents: int = 3072
-    stock: bool = False
 
 
 class Block(nn.Module):
@@ -86,31 +81,27 @@ class Lvsm(nn.Module):
 
     def __init__(self, config: LvsmConfig):
         super().__init__()
-        c, bias = config, config.stock
-        make = twin.encoder_block if c.stock else Block
-        blocks = lambda count: nn.ModuleList(make(c.dim, c.num_heads, c.feed_forward_dim) for _ in range(count))
-        self.stock = c.stock
+        c = config
+        blocks = lambda count: nn.ModuleList(Block(c.dim, c.num_heads, c.feed_forward_dim) for _ in range(count))
         self.latents = Latents(c.num_latents, c.dim)
-        self.patch_embed = nn.Linear(twin.CONTEXT_PATCH_DIM, c.dim, bias=bias)
+        self.patch_embed = nn.Linear(twin.CONTEXT_PATCH_DIM, c.dim, bias=False)
         self.encoder = blocks(c.num_encoder_blocks)
-        self.ray_embed = nn.Linear(twin.RAY_PATCH_DIM, c.dim, bias=bias)
-        self.input_norm = nn.LayerNorm(c.dim, bias=bias)
+        self.ray_embed = nn.Linear(twin.RAY_PATCH_DIM, c.dim, bias=False)
+        self.input_norm = nn.LayerNorm(c.dim, bias=False)
         self.decoder = blocks(c.num_renderer_blocks)
-        self.output_norm = nn.LayerNorm(c.dim, bias=bias)
-        self.to_pixels = nn.Linear(c.dim, twin.PIXEL_PATCH_DIM, bias=bias)
-        if not c.stock:
-            for stack in (self.encoder, self.decoder):
-                for index, block in enumerate(stack):
-                    for layer in (block.in_proj, block.out_proj, block.up, block.down):
-                        nn.init.normal_(layer.weight, std=0.02 / (2 * (index + 1)) ** 0.5)
-            for layer in (self.patch_embed, self.ray_embed, self.to_pixels):
-                nn.init.normal_(layer.weight, std=0.02)
+        self.output_norm = nn.LayerNorm(c.dim, bias=False)
+        self.to_pixels = nn.Linear(c.dim, twin.PIXEL_PATCH_DIM, bias=False)
+        for stack in (self.encoder, self.decoder):
+            for index, block in enumerate(stack):
+                for layer in (block.in_proj, block.out_proj, block.up, block.down):
+                    nn.init.normal_(layer.weight, std=0.02 / (2 * (index + 1)) ** 0.5)
+        for layer in (self.patch_embed, self.ray_embed, self.to_pixels):
+            nn.init.normal_(layer.weight, std=0.02)
 
     def encode(self, images: Tensor, intrinsics: Tensor, c2w: Tensor) -> Tensor:
         """Posed context images `[B, V, H, W, 3]` to latents `[B, L, D]`."""
         rays = twin.plucker(intrinsics, c2w, *images.shape[2:4])
-        images = images if self.stock else 2 * images - 1
-        patches = self.patch_embed(twin.context_patches(images, rays))
+        patches = self.patch_embed(twin.context_patches(2 * images - 1, rays))
         latents = self.latents.weight.expand(len(patches), -1, -1)
         tokens = torch.cat([latents, patches], 1)
         for block in self.encoder:
@@ -122,9 +113,7 @@ class Lvsm(nn.Module):
         rays = twin.plucker(intrinsics, c2w, height, width)
         batch, targets = rays.shape[:2]
         patches = self.ray_embed(twin.patchify(rays.flatten(0, 1)[:, None]))  # [B*T, Q, D]
-        memory = self.input_norm(memory) if self.stock else memory
-        tokens = torch.cat([patches, memory.repeat_interleave(targets, 0)], 1)
-        tokens = tokens if self.stock else self.input_norm(tokens)
+        tokens = self.input_norm(torch.cat([patches, memory.repeat_interleave(targets, 0)], 1))
         for block in self.decoder:
             tokens = block(tokens)
         pixels = torch.sigmoid(self.to_pixels(self.output_norm(tokens[:, : patches.shape[1]])))

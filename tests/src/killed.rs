@@ -1,4 +1,4 @@
-//! A training that kills itself with SIGKILL at a chosen moment: `clift-killed MOMENT train CONFIG [--set K=V] [--only S]`.
+//! A training that kills itself with SIGKILL at a chosen moment: `clift-killed MOMENT train CONFIG [--set K=V]`.
 //!
 //! A moment is `step/STAGE/N` (step N was made, not saved), `saved/STAGE/N` (its checkpoint is there) or `set/N` (N sets
 //! are clustered). Signals from outside cannot be timed like that: a step takes milliseconds.
@@ -7,7 +7,7 @@ use std::process::Command;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use clift_train::{Config, Event, Run, RunOptions, RunStep, Sink, Stage, read_config};
+use clift_train::{Config, Event, Run, RunOptions, Sink, read_config};
 
 struct Killer {
     moment: String,
@@ -38,21 +38,14 @@ fn main() {
     let moment = args.next().expect("a moment");
     assert_eq!(args.next().as_deref(), Some("train"));
     let config = args.next().expect("a config");
-    let (mut set, mut options) = (Vec::new(), RunOptions::default());
+    let mut set = Vec::new();
     while let (Some(flag), Some(value)) = (args.next(), args.next()) {
-        let named = |step: &RunStep| step.name() == value;
-        match flag.as_str() {
-            "--set" => set.push(value),
-            "--only" => {
-                let steps = [Stage::Stage1.into(), RunStep::Clusters, Stage::Stage2.into()];
-                options.only = steps.into_iter().find(named);
-            }
-            _ => panic!("{flag} is not known"),
-        }
+        assert_eq!(flag, "--set");
+        set.push(value);
     }
     let (config, _) = read_config::<Config>(config.as_ref(), &set).expect("a valid config");
     let mut sink = Killer { moment };
-    let run = Run::open(config, &options, &mut sink).expect("a free run directory");
-    run.train(options.only, &AtomicBool::new(false), &mut sink).expect("nothing else comes in between");
+    let run = Run::open(config, &RunOptions::default(), &mut sink).expect("a free run directory");
+    run.train(None, &AtomicBool::new(false), &mut sink).expect("nothing else comes in between");
     panic!("the run ended before {}", sink.moment);
 }

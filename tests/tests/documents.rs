@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-use clift_data::{StateDict, write_state_dict};
 use serde_json::json;
 
 use crate::data::poses::write_colmap;
+use crate::evaluation::checkpoints::write_first_stage;
 use crate::evaluation::eval::write_vgg;
 use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, start};
 use crate::viewer::tab::Viewer;
@@ -16,16 +16,14 @@ use crate::viewer::tab::Viewer;
 const KEY: &str = "00000000000000b1";
 
 /// Words of the documents, and those for small data.
-const SMALLER: [(&str, &str); 9] = [
+const SMALLER: [(&str, &str); 7] = [
     // Later examples read the other data.
     (" /data/re10k-txt /data/re10k ", " /data/re10k-txt /data/converted "),
     (" /data/", " data/"),
-    ("5aca87f95a9412c6", KEY),
     ("--scene KEY", "--scene 00000000000000b1"),
     ("chunks|scenes", "chunks"),
-    ("--distance 45..135", "--distance 4..7"),
+    ("--distance 45..135", "--distance 6..7"),
     ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
-    ("--render 256", "--render 2"),
     ("--stored-tokens 256", "--stored-tokens 2"),
 ];
 
@@ -110,8 +108,7 @@ fn every_documented_command_runs() {
         }
     }
     assert!(failures.is_empty(), "{} of {count} commands fail:\n{}", failures.len(), failures.join("\n"));
-    let expected =
-        "codec compare completions data doctor encode eval export flops import metrics plan render train view";
+    let expected = "codec compare data doctor encode eval export flops import metrics plan render train view";
     assert_eq!(names.into_iter().collect::<Vec<_>>().join(" "), expected, "commands with an example");
 }
 
@@ -167,7 +164,7 @@ fn smaller(line: &str) -> String {
 
 /// Removes what an earlier example wrote where this one writes. Evaluations of runs stay: a user has them, too.
 fn make_room(folder: &Path, args: &[String]) {
-    let is_output = |flag: &str| ["-o", "--out", "--json", "--csv", "--images"].contains(&flag);
+    let is_output = |flag: &str| ["-o", "--out", "--json", "--csv"].contains(&flag);
     let flags = args.windows(2).filter(|pair| is_output(&pair[0])).map(|pair| &pair[1]);
     let positional = match [args[0].as_str(), args.get(1).map_or("", String::as_str)] {
         ["data", "synth"] => args.get(2),
@@ -215,14 +212,7 @@ fn shrink(args: &mut Vec<String>) {
             args.retain(|arg| arg != "--set" && arg != "eval.num_context=4");
             set(args, &["eval.num_context=2"]);
         }
-        ("import", _) => {
-            // The shapes of the DL3DV network determine its heads.
-            if !args.iter().any(|arg| arg == "released-dl3dv") {
-                default(args, "--num-heads", "3");
-            } else if let Some(file) = args.get_mut(1) {
-                *file = format!("dl3dv-{file}");
-            }
-        }
+        ("import", _) => default(args, "--num-heads", "3"),
         ("render", _) if !args.iter().any(|arg| arg == "poses.json") => default(args, "--frames", "2"),
         ("view", _) => default(args, "--port", "0"),
         ("data", Some("synth")) => {
@@ -287,19 +277,7 @@ fn prepare(base: &Path) {
     for name in ["second_stage.ckpt", "last.ckpt"] {
         copy(&fixture("checkpoints/re10k.ckpt"), name);
     }
-    let changed = |from: &str, to: &str, change: &dyn Fn(&str) -> Option<String>| {
-        let state = StateDict::open(&fixture(from)).expect("a checkpoint");
-        let keys = state.keys().filter_map(|key| Some((key, change(key)?)));
-        let tensors = keys.map(|(key, name)| {
-            let shape = state.tensor(key).expect("a tensor").1.iter().map(|&size| size as usize).collect();
-            (name, shape, state.read(key).expect("a tensor"))
-        });
-        write_state_dict(&base.join(to), &tensors.collect::<Vec<_>>(), &[]).expect("writable");
-    };
-    let first = |key: &str| (!key.contains("squeezer")).then(|| key.to_owned());
-    changed("checkpoints/re10k.ckpt", "first_stage.ckpt", &first);
-    let renamed = |key: &str| Some(key.replace("attn.q_norm", "attn.query_rms").replace("attn.k_norm", "attn.key_rms"));
-    changed("checkpoints/dl3dv.ckpt", "dl3dv-last.ckpt", &renamed);
+    write_first_stage(&base.join("first_stage.ckpt"));
 
     let clift = |args: &[&str]| drop(finish(start(Command::new(BINARY).args(args).current_dir(base))).ok());
     let config = repository("tests/micro.toml");

@@ -2,8 +2,8 @@
 //!
 //! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
 //! checks data sets; `input` is wrong or damaged input; `bench` times the cases; `viewer` opens scenes in a
-//! browser. `architecture` and `links` read the sources instead, `licences` reads the dependencies, and
-//! `documents` runs every command of the documents, `examples` every example.
+//! browser. `architecture` and `links` read the sources instead, `documents` runs every command of the documents, `examples`
+//! every example.
 
 mod architecture;
 mod bench;
@@ -12,7 +12,6 @@ mod documents;
 mod evaluation;
 mod examples;
 mod input;
-mod licences;
 mod links;
 mod support;
 mod training;

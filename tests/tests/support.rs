@@ -17,7 +17,7 @@ pub fn repository(path: &str) -> PathBuf {
 /// Reports that this test cannot run on this machine, as a line `skipped: TEST: REASON` that `.ci/run` repeats at its end.
 ///
 /// # Panics
-/// Where the variable `CLIFT_REQUIRE_TOOL` is set, such as `CLIFT_REQUIRE_FFMPEG` for the tool `ffmpeg`.
+/// Where the variable `CLIFT_REQUIRE_TOOL` is set, such as `CLIFT_REQUIRE_CHROMIUM` for the tool `chromium`.
 #[track_caller]
 pub fn skip(tool: &str, reason: &str) {
     let variable = format!("CLIFT_REQUIRE_{}", tool.to_uppercase());
@@ -81,11 +81,6 @@ impl Ran {
     }
 }
 
-/// Runs the command line, for words with spaces in them.
-pub fn clift<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Ran {
-    finish(start(Command::new(BINARY).args(args)))
-}
-
 pub const BINARY: &str = env!("CARGO_BIN_EXE_clift-under-test");
 
 /// Starts a command that [`finish`] waits for, on the CPU: in a build with wgpu it finds no adapter, whose kernels would take
@@ -115,20 +110,6 @@ pub fn wait_until(child: &mut Child, what: &str, is_there: impl Fn() -> bool) {
     }
 }
 
-/// A value in [0, 1), the same in every test run (the upper bits of an LCG).
-pub fn draw(state: &mut u64) -> f64 {
-    *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-    (*state >> 33) as f64 / (1_u64 << 31) as f64
-}
-
-/// Waits for a time, or until the child has ended.
-pub fn wait_at_most(time: Duration, child: &mut Child) {
-    let until = Instant::now() + time;
-    while Instant::now() < until && child.try_wait().expect("a child").is_none() {
-        std::thread::sleep(Duration::from_millis(1));
-    }
-}
-
 pub fn finish(child: Child) -> Ran {
     let output = child.wait_with_output().expect("the binary under test ends");
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("it prints UTF-8");
@@ -152,28 +133,6 @@ impl Shared {
     /// The micro run `run` with flags and changed keys, see [`Place::train`].
     pub const fn new(words: &'static str, set: &'static [&'static str]) -> Self {
         Self { words, set, files: OnceLock::new() }
-    }
-}
-
-/// A small file system in memory, unmounted when dropped; needs root, without which the test is skipped.
-pub struct SmallDisk<'a>(&'a Path);
-
-impl<'a> SmallDisk<'a> {
-    pub fn mount(folder: &'a Path, kib: u64) -> Option<Self> {
-        std::fs::create_dir(folder).expect("writable");
-        let options = format!("size={kib}k");
-        let mount = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "clift-test"]).arg(folder).output();
-        let disk = mount.ok().filter(|output| output.status.success()).map(|_| Self(folder));
-        if disk.is_none() {
-            skip("tmpfs", "no right to mount a tmpfs");
-        }
-        disk
-    }
-}
-
-impl Drop for SmallDisk<'_> {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg(self.0).status();
     }
 }
 
@@ -310,17 +269,6 @@ impl Place {
 
     pub fn model(&self, name: &str) -> Weights {
         Weights::read(&self.bytes(&format!("{name}/model.safetensors")))
-    }
-
-    /// Expects the same clusters and the same weights of both stages, bit for bit.
-    pub fn assert_same_result(&self, run: &str, other: &str) {
-        for stage in ["stage1", "stage2"] {
-            assert!(self.weights(run, stage) == self.weights(other, stage), "{stage} of {run} and {other} differs");
-        }
-        for file in ["clusters/index.json", "clusters/clusters.bin"] {
-            let same = self.bytes(&format!("{run}/{file}")) == self.bytes(&format!("{other}/{file}"));
-            assert!(same, "{file} of {run} and {other} differs");
-        }
     }
 
     /// Expects the same files but for times: weights, clusters, metrics, skipped steps, samples, the progress in the last

@@ -5,10 +5,8 @@
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the message of a variant says what its fields are")]
 pub enum CameraError {
-    /// A camera holds a NaN or an infinity, its rotation matrix is not orthonormal, or it is too far away.
     #[error("bad camera: {what}")]
     BadCamera { what: String },
-    /// The camera centres that define a scene's scale coincide.
     #[error(
         "scene {key} has no baseline: {}; the method needs parallax, photos from different places: a camera that only turns on \
          a tripod shows no depth",
@@ -21,7 +19,6 @@ pub enum CameraError {
         }
     )]
     ZeroBaseline { key: String, num_views: usize, extent: f64, threshold: f64 },
-    /// A pose of a scene cannot be used.
     #[error("frame {frame} of scene {key}: {source}")]
     InFrame { key: String, frame: usize, source: Box<CameraError> },
 }

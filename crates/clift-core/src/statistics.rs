@@ -88,41 +88,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn medians_ignore_the_order_of_the_values() {
+    fn statistics_of_few_and_no_values_are_those_by_hand() {
         for (values, middle) in [(&[3.0, 1.0, 2.0][..], 2.0), (&[4.0, 1.0, 3.0, 2.0], 2.5), (&[7.0], 7.0)] {
             assert_eq!(median(values), middle);
         }
-        assert!(median(&[]).is_nan());
-    }
-
-    #[test]
-    fn p95_is_the_value_of_the_nearest_rank() {
         let values = |count: u32| (1..=count).rev().map(f64::from).collect::<Vec<_>>();
-        let expected = [(1, 1.0), (5, 5.0), (19, 19.0), (20, 19.0), (21, 20.0), (100, 95.0), (101, 96.0)];
-        for (count, expected) in expected {
+        for (count, expected) in [(1, 1.0), (5, 5.0), (19, 19.0), (20, 19.0), (21, 20.0), (100, 95.0), (101, 96.0)] {
             assert_eq!(p95(&values(count)), expected, "of {count}");
         }
-        assert!(p95(&[]).is_nan());
-    }
-
-    #[test]
-    fn quartiles_are_interpolated() {
+        assert!(p95(&[]).is_nan() && median(&[]).is_nan());
         assert_eq!(quartiles(&[5.0, 1.0, 3.0, 2.0, 4.0]), Some([2.0, 4.0]));
         assert_eq!(quartiles(&[4.0, 1.0, 2.0, 3.0]), Some([1.75, 3.25]));
         assert_eq!((quartiles(&[7.0]), quartiles(&[])), (Some([7.0; 2]), None));
-    }
-
-    #[test]
-    fn standard_error_divides_by_one_less_than_the_count() {
         // Deviation sqrt(32), over sqrt(2).
         assert_eq!((mean(&[22.0, 30.0]), standard_error(&[22.0, 30.0])), (Some(26.0), Some(4.0)));
         assert_eq!((mean(&[]), standard_error(&[]), standard_error(&[1.0])), (None, None, None));
-    }
-
-    #[test]
-    fn min_median_max_prints_with_the_precision_asked_for() {
         let summary = MinMedianMax::of(&[4.0, 1.0, 2.0, 8.0]).unwrap();
-        assert_eq!(summary, MinMedianMax { min: 1.0, median: 3.0, max: 8.0 });
         assert_eq!((format!("{summary:.1}"), MinMedianMax::of(&[])), ("1.0 / 3.0 / 8.0".into(), None));
     }
 }

@@ -30,13 +30,11 @@ mod rows;
 mod testing;
 
 pub use adapter::{AdapterClass, MatrixShape};
-pub use attention::attention::{
-    AttentionGradients, AttentionInputs, AttentionResults, AttentionSizes, HeadRows, attention_backward,
-    attention_backward_tile, attention_forward, attention_forward_tile,
-};
+pub use attention::attention::{AttentionGradients, AttentionSizes, HeadRows, attention_backward, attention_forward};
 pub use attention::cluster_attention::{ClusterSizes, cluster_attention_backward, cluster_attention_forward};
 pub use attention::head_transform::{PartTransform, transform_heads};
 pub use attention::matrix_scores::AttentionTile;
+pub use attention::tiles::attention_tiles;
 pub use buffers::adamw::{AdamW, adamw, gradient_norm};
 pub use buffers::buffer::{Buffer, Matrices, Values};
 pub use buffers::elementwise::cast;

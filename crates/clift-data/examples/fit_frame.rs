@@ -15,7 +15,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let centred = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
     while let (Some(from), Some(to)) = (words.next(), words.next()) {
         let frame = decode_image(&std::fs::read(&from)?, &from, 0)?;
-        let (fitted, _) = fit_image(&frame, centred, width, height, false)?;
+        let (fitted, _) = fit_image(&frame, centred, width, height)?;
         std::fs::write(to, encode_png(&fitted)?)?;
     }
     Ok(())

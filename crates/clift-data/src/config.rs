@@ -5,13 +5,11 @@ use std::path::PathBuf;
 use clift_core::{PoseRotation, PoseScale};
 use serde::{Deserialize, Serialize};
 
-use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
 use crate::sampling::view_sampler::ViewSampler;
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
-use crate::sources::photos::image_cache::ImageCacheConfig;
 use crate::synthetic::config::SyntheticConfig;
 
 /// Data set, image size, pose normalisation and view sampling.
@@ -33,12 +31,8 @@ pub struct DataConfig {
     /// Cameras that define the scale of a scene: the `context` views, or `all`, contexts and targets (as in the authors'
     /// released code).
     pub pose_scale: PoseScale,
-    /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
-    pub crop: Crop,
     /// Colour of masked and transparent pixels, RGB of 0 to 255.
     pub background: [u8; 3],
-    /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
-    pub flip: bool,
     /// For data sets without a test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
     /// never read in training, as in the practice of `NeRF`; 0 holds out no frame, and training scenes are evaluated.
     pub hold_out: usize,
@@ -46,8 +40,6 @@ pub struct DataConfig {
     pub filters: SceneFilters,
     /// Options of the synthetic scenes.
     pub synthetic: SyntheticConfig,
-    /// Cache of decoded photos.
-    pub image_cache: ImageCacheConfig,
     /// Sampling of context and target frames for training.
     pub views: ViewSampler,
     /// Number of threads that prepare batches; 0 prepares them between the steps. Unset: 1 on a CPU; on a GPU one per core, at
@@ -70,13 +62,10 @@ impl Default for DataConfig {
             height: 256,
             pose_rotation: PoseRotation::default(),
             pose_scale: PoseScale::default(),
-            crop: Crop::Protocol,
             background: [0; 3],
-            flip: false,
             hold_out: 8,
             filters: SceneFilters::default(),
             synthetic: SyntheticConfig::default(),
-            image_cache: ImageCacheConfig::default(),
             views: ViewSampler::default(),
             num_threads: None,
             num_prefetch: 4,
@@ -104,7 +93,6 @@ impl DataConfig {
             height: self.height,
             pose_rotation: self.pose_rotation,
             pose_scale: self.pose_scale,
-            exact_principal_point: self.crop == Crop::Exact,
             half_size: false,
         }
     }

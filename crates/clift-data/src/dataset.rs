@@ -9,19 +9,19 @@ use crate::error::DataError;
 use crate::sampling::clip_reader::{ClipOptions, ClipReader};
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
-use crate::sources::chunks::chunk_source::ScanProgress;
+use crate::sources::chunks::table::ScanProgress;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
-use crate::sources::open::{OpenedSource, scan_source};
+use crate::sources::open::{OpenedSource, open_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 use clift_core::BadConfig;
 
-/// Opens one split of the data set of a config. `progress` is called with the numbers of examined and of all chunks while
-/// `data.filters` read the chunks: the first opening of a large data set can take minutes.
+/// Opens one split of the data set of a config. With `data.filters`, every chunk is read: of a large data set this can take a
+/// minute, in which `progress` is called.
 ///
 /// # Errors
 /// The errors of opening the source, [`DataError::BadConfig`] for a missing key, and [`DataError::NoScenes`] when the
@@ -57,10 +57,10 @@ fn open_files(
         files,
         background: config.background,
         min_size: [config.width.max(config.min_size[0]), config.height.max(config.min_size[1])],
-        image_cache: Some(config.image_cache.clone()),
+        caches_photos: true,
         reads_chunks: false,
     };
-    let mut opened = scan_source(&DatasetRoot::find(root)?, split, &options, progress)?;
+    let mut opened = open_source(&DatasetRoot::find(root)?, split, &options, progress)?;
     let source = &opened.source;
     let has_dl3dv = || (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene)));
     let is_divided = !opened.shares_scenes || config.files.test_scenes.is_some();
@@ -162,7 +162,6 @@ mod tests {
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
     use crate::synthetic::config::Look;
     use crate::testing::rooms;
-    use clift_core::item_rng;
 
     #[test]
     fn small_synthetic_clips_show_what_reduced_ones_show() {
@@ -224,8 +223,6 @@ mod tests {
         let record = |(scene, num_frames): (usize, usize)| {
             Ok(SceneRecord {
                 key: format!("of-{num_frames}"),
-                url: String::new(),
-                timestamps: (0..num_frames as i64).collect(),
                 cameras: rooms.cameras(scene)?[..num_frames].to_vec(),
                 images: vec![vec![0]; num_frames],
             })
@@ -254,9 +251,6 @@ mod tests {
         let OpenedSource { source, report, .. } = open_training_dataset(&data, 4, &mut |_, _| ()).unwrap();
         assert_eq!((source.num_scenes(), source.key(0)), (1, "of-8"));
         assert!(report.to_string().contains("2 shorter than the 6 frames"), "{report}");
-        let too_short = data.views.sample_frames(5, &[], 4, 4, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
-        assert_eq!(too_short.to_string(), "not enough frames: 6 needed, 5 in the scene");
-        assert_eq!(open_dataset(&data, Split::Train, &mut |_, _| ()).unwrap().source.num_scenes(), 3);
         data.views = ViewSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
         let message = open_training_dataset(&data, 0, &mut |_, _| ()).err().unwrap().to_string();
         assert!(message.contains("train: 0 of 3 scenes used; 3 shorter than the 10 frames"), "{message}");

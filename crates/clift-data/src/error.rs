@@ -42,22 +42,9 @@ pub enum DataError {
     /// A scene of photos cannot be used: malformed cameras, an unknown camera model, or no images.
     #[error("bad scene: {what}: {path}", path = path.display())]
     BadScene { what: String, path: PathBuf },
-    /// The end of an image file is missing.
-    #[error("bad scene: the image is truncated: its {num_bytes} bytes have no end marker: {path}", path = path.display())]
-    TruncatedImage { num_bytes: u64, path: PathBuf },
-    /// The data of an image ends early or is damaged in its middle.
-    #[error("bad scene: the image is damaged: {what}: {path}", path = path.display())]
-    DamagedImage { what: String, path: PathBuf },
-    /// An image has another aspect ratio than its camera.
-    #[error(
-        "bad scene: the image is {width}x{height}, aspect ratio {:.3}, but its camera has {camera_aspect:.3}; the image may \
-         have been rotated or cropped after the calibration: {path}",
-        *width as f64 / *height as f64, path = path.display()
-    )]
-    WrongAspect { width: usize, height: usize, camera_aspect: f64, path: PathBuf },
-    /// A mask is unreadable or has another aspect ratio than its image.
-    #[error("bad scene: bad mask: {what}: {path}", path = path.display())]
-    BadMask { what: String, path: PathBuf },
+    /// An image or its mask is truncated or damaged, or has another aspect ratio than its camera; `reason` completes "a frame ..".
+    #[error("bad scene: {what}: {path}", path = path.display())]
+    BadPhoto { reason: &'static str, what: String, path: PathBuf },
     /// A file of camera poses is malformed.
     #[error("bad poses: {what}: {path}", path = path.display())]
     BadPoses { what: String, path: PathBuf },

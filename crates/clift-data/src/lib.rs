@@ -40,7 +40,8 @@ pub use scene_source::{SceneSource, Split, is_held_out};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
 
 // Layouts on disk, and synthetic scenes.
-pub use sources::chunks::chunk_source::{ChunkSource, ScanProgress};
+pub use sources::chunks::chunk_source::ChunkSource;
+pub use sources::chunks::table::ScanProgress;
 pub use sources::chunks::writer::{SceneRecord, write_chunks};
 pub use sources::dataset_root::DatasetRoot;
 pub use sources::filters::SceneFilters;
@@ -48,10 +49,9 @@ pub use sources::keys::is_dl3dv_key;
 pub use sources::kind::SourceKind;
 pub use sources::open::{OpenedSource, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
-pub use sources::photos::image_cache::ImageCacheConfig;
 pub use sources::photos::photo::PosesFrom;
 pub use sources::subset::SceneSubset;
-pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
+pub use sources::test_scenes::TestScenes;
 pub use synthetic::config::{Look, SyntheticConfig};
 pub use synthetic::source::SyntheticSource;
 
@@ -59,9 +59,7 @@ pub use synthetic::source::SyntheticSource;
 pub use sampling::clip::{Clip, ViewIndices};
 pub use sampling::clip_reader::{ClipOptions, ClipReader};
 pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views, even_views_of};
-pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
-pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
 pub use sampling::training_clips::TrainingClips;
 pub use sampling::view_sampler::{ViewSampler, Window};
 
@@ -73,16 +71,14 @@ pub use geometry::pose_file::read_poses;
 
 // Images.
 pub use image::codec::{decode_image, encode_jpeg, encode_png, image_size};
-pub use image::fit::{Crop, fit_image};
+pub use image::fit::fit_image;
 pub use image::undistort::Undistortion;
 
-// Tools for data sets: describe, check, convert, index.
+// Tools for data sets: describe, check, index.
 pub use files::hash::hash_file;
 pub use tools::check::result::{FrameCheck, PairCheck, SceneCheck, Verdict};
-pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, skipped_scenes};
-pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
-pub use tools::export::{ImageEncoding, read_scene, write_evaluation_index};
-pub use tools::index_statistics::IndexStatistics;
+pub use tools::check::scene::{check_scene, note_skipped_frames, skipped_scenes};
+pub use tools::export::{read_scene, write_evaluation_index};
 pub use tools::info::SourceInfo;
 pub use tools::overlap_index::{OverlapOptions, write_overlap_index};
 

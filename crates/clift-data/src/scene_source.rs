@@ -40,23 +40,12 @@ pub trait SceneSource: Send + Sync {
         Ok(self.cameras(scene)?.len())
     }
 
-    /// Returns the time stamp of every frame: microseconds in RealEstate10K, frame numbers otherwise. The default returns
-    /// the frame indices.
-    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        Ok((0..self.num_frames(scene)? as i64).collect())
-    }
-
-    /// Returns the URL of a scene; empty if unknown.
-    fn url(&self, _scene: usize) -> Result<String, DataError> {
-        Ok(String::new())
-    }
-
     /// Returns the file name of every frame; empty for frames without files of their own.
     fn frame_names(&self, _scene: usize) -> Result<Vec<String>, DataError> {
         Ok(Vec::new())
     }
 
-    /// Returns the frames of a scene that are held out of training, in order. The default returns every `every`-th frame
+    /// Returns the frames of a scene that are held out of training, in order: the default returns every `every`-th one
     /// ([`is_held_out`]); captures that list the frames of their splits return the listed ones. With 0 no frame is held out.
     fn held_out(&self, scene: usize, every: usize) -> Result<Vec<usize>, DataError> {
         let num_frames = if every == 0 { 0 } else { self.num_frames(scene)? };

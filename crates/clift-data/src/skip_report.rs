@@ -84,26 +84,31 @@ impl SkipReport {
         counts
     }
 
+    /// Returns the names of the skipped frames per reason.
+    pub fn frame_names(&self) -> BTreeMap<&str, Vec<&str>> {
+        let mut names: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+        for skip in &self.frames {
+            names.entry(&skip.reason).or_default().push(&skip.frame);
+        }
+        names
+    }
+
     pub(crate) fn append(&mut self, other: Self) {
         self.num_scenes += other.num_scenes;
         self.skips.extend(other.skips);
         self.frames.extend(other.frames);
         self.notes.extend(other.notes);
     }
-
-    /// Returns the names of the skipped frames per reason.
-    pub fn frame_names(&self) -> BTreeMap<&str, Vec<&str>> {
-        let mut names: BTreeMap<_, Vec<_>> = BTreeMap::new();
-        for skip in &self.frames {
-            names.entry(skip.reason.as_str()).or_default().push(skip.frame.as_str());
-        }
-        names
-    }
 }
 
 impl fmt::Display for SkipReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} of {} scenes used", self.num_used(), self.num_scenes)?;
+        let all = plural(self.num_scenes, "scene");
+        match (self.num_used(), self.num_scenes) {
+            (used, num_scenes) if used < num_scenes => write!(f, "{used} of {all} used")?,
+            (_, 0 | 1) => write!(f, "{all} used")?,
+            _ => write!(f, "all {all} used")?,
+        }
         let counts = self.counts();
         for (reason, count) in counts.iter().take(MAX_REASONS_SHOWN) {
             write!(f, "; {count} {reason}")?;
@@ -116,11 +121,6 @@ impl fmt::Display for SkipReport {
         }
         self.notes.iter().try_for_each(|note| write!(f, "; {note}"))
     }
-}
-
-/// Returns a note on these scenes, such as `2 scenes unreadable now (a, b)`; `None` for none.
-pub(crate) fn note_on<S: AsRef<str>>(keys: &[S], what: &str) -> Option<String> {
-    (!keys.is_empty()).then(|| format!("{} {what} ({})", plural(keys.len(), "scene"), first_few(keys)))
 }
 
 /// Joins the first few names, with dots for the others.
@@ -142,30 +142,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reports_print_used_scenes_and_count_reasons() {
+    fn reports_print_used_scenes_reasons_skipped_frames_and_notes() {
         let mut report = SkipReport::new(5);
-        assert_eq!(report.to_string(), "5 of 5 scenes used");
+        assert!(!report.has_content() && report.to_string() == "all 5 scenes used");
+        report.notes.push("both splits hold all scenes".into());
+        assert!(report.has_content() && !report.has_skips());
         report.skip("a", "shorter than 46 frames");
         report.skip("b", "null in the evaluation index");
         report.skip("c", "shorter than 46 frames");
-        assert_eq!(report.to_string(), "2 of 5 scenes used; 1 null in the evaluation index; 2 shorter than 46 frames");
-        (0..8).for_each(|number| report.skip("d", format!("broken {number}")));
-        assert!(report.to_string().ends_with("; 1 broken 7; 3 for other reasons"), "{report}");
-    }
-
-    #[test]
-    fn reports_print_skipped_frames_then_notes() {
-        let mut report = SkipReport::new(1);
-        assert!(!report.has_content());
-        report.notes.push("both splits hold all scenes".into());
-        assert!(report.has_content() && !report.has_skips());
         for frame in ["1.jpg", "5.jpg", "6.jpg", "7.jpg"] {
             report.skip_frame("fox", frame, "without an image");
         }
         report.skip_frame("fox", "9.jpg", "named twice");
-        let expected = "1 of 1 scenes used; 1 frame named twice (9.jpg); \
-            4 frames without an image (1.jpg, 5.jpg, 6.jpg, ..); both splits hold all scenes";
+        let expected = "2 of 5 scenes used; 1 null in the evaluation index; 2 shorter than 46 frames; \
+            1 frame named twice (9.jpg); 4 frames without an image (1.jpg, 5.jpg, 6.jpg, ..); both splits hold all scenes";
         assert_eq!(report.to_string(), expected);
-        assert!(report.has_skips());
+        (0..8).for_each(|number| report.skip("d", format!("broken {number}")));
+        assert!(report.to_string().contains("; 1 broken 7; 3 for other reasons; 1 frame"), "{report}");
     }
 }

@@ -13,7 +13,7 @@ use std::path::Path;
 use clift_data::{ClipReader, DataConfig, DatasetRoot, SourceOptions, Split, open_source};
 use clift_eval::Canvas;
 use clift_model::{DeviceName, ModelPath, SelectionPreset, TrainedModel};
-use clift_scene::{Coding, ContextChoice, EncodeOptions, SceneOptions, SceneRenderer, TokenFormat, encode_scene};
+use clift_scene::{ContextChoice, EncodeOptions, SceneOptions, SceneRenderer, TokenCoding, encode_scene};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -22,7 +22,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     // Open the model, and the photos in the size and with the normalization of poses that the model was trained on.
     let path = ModelPath::find(Path::new(run))?;
     let model = TrainedModel::open(Path::new(run), &DeviceName::Flex.open()?)?;
-    let source = open_source(&DatasetRoot::find(Path::new(photos))?, Split::Test, &SourceOptions::default())?.source;
+    let source =
+        open_source(&DatasetRoot::find(Path::new(photos))?, Split::Test, &SourceOptions::default(), &mut |_, _| ())?
+            .source;
     let config: toml::Table = std::fs::read_to_string(path.dir.join("config.toml"))?.parse()?;
     let data: DataConfig = config["data"].clone().try_into()?;
     let reader = ClipReader { source, options: data.clip_options() };
@@ -34,11 +36,12 @@ fn main() -> Result<(), Box<dyn Error>> {
             model_path: run.clone(),
             ..EncodeOptions::default()
         },
-        coding: Some(Coding::Plain(TokenFormat::F16)),
+        refine_steps: 0,
+        coding: Some(TokenCoding::F16),
         weights: path.weights,
         out: format!("{out}.clift").into(),
     };
-    let written = encode_scene(&model, &reader, 0, &options)?;
+    let written = encode_scene(&model, &reader, 0, &options, &mut |_, _| ())?;
     let scene = &written.encoded.scene;
 
     // Render the second context view from half of the stored tokens: those nearest to its camera.

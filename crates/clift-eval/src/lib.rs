@@ -23,26 +23,23 @@ pub use error::EvalError;
 // Settings of an evaluation.
 pub use config::eval_config::EvalConfig;
 pub use config::experiment::Experiment;
-pub use config::method::{Method, MethodName};
+pub use config::method::Method;
 pub use config::split::{EvalFrames, EvalSplit};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.
 pub use evaluator::evaluator::{Evaluator, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
-pub use evaluator::progress::{EvalProgress, Process, SharedScenes};
+pub use evaluator::progress::EvalProgress;
+pub use evaluator::sheets::file_name;
 pub use report::page::RunDescription;
-pub use report::training::TrainingCurve;
 
 // One scene with every method and token count.
 pub use sweep::eval_models::EvalModels;
-pub use sweep::evaluate_scene::evaluate_scene;
-pub use sweep::predictions::{ExternalMethod, distinct_file_name, file_name};
-pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;
 
 // Results and comparisons.
-pub use statistics::compare::{Comparison, Evaluation, MethodFilter};
+pub use statistics::compare::{Comparison, Evaluation};
 pub use statistics::eval_results::EvalResults;
 pub use statistics::summary::{Summary, training_scenes_note};
 pub use statistics::text_table::table;
@@ -50,8 +47,6 @@ pub use statistics::text_table::table;
 // Figures and animations.
 pub use figures::animation::Animation;
 pub use figures::canvas::Canvas;
-pub use figures::scene_figure::SceneFigures;
-pub use figures::video::Video;
 
 // The machine, for reports.
 pub use system::machine::machine_rows;

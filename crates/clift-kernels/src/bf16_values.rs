@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::primitives::packing::pack_rows;
 use crate::primitives::partition::PIECE;
 use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::{Bf16, Simd};
+use crate::simd::vector::{Bf16, Operands, Simd};
 
 /// Rounds values to bf16, ties to even. Entry `i` of `to` has the bits of value `2 i`, and above them those of value `2 i + 1`;
 /// behind an odd number of values follows zero.
@@ -38,10 +38,8 @@ struct Pack<'a> {
 }
 
 impl Kernel for Pack<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         pack_rows::<S, Bf16>(simd, once(self.values), self.to.len(), self.to);
     }
 }
@@ -57,32 +55,21 @@ mod tests {
     fn values_return_rounded_to_bf16() {
         for count in [0, 1, 2, 31, 33, 2 * PIECE + 1, 5 * PIECE] {
             let mut values = random(count, 1);
-            for (value, special) in values.iter_mut().zip([f32::INFINITY, -0.0, f32::MAX, 1e-40]) {
+            for (value, special) in values.iter_mut().zip([f32::INFINITY, f32::NAN, -0.0, f32::MAX, 1e-40]) {
                 *value = special;
             }
-            let expected: Vec<u32> = values.iter().map(|&x| bf16::from_f32(x).to_f32().to_bits()).collect();
             for set in InstructionSet::available() {
                 let mut packed = vec![f32::NAN; count.div_ceil(2)];
                 pack_bf16(set, &values, &mut packed);
                 let mut unpacked = vec![f32::NAN; count];
                 unpack_bf16(&packed, &mut unpacked);
-                // The instruction flushes values below the normal ones to zero.
-                let bits = unpacked.iter().zip(&values).zip(&expected);
-                let wrong = bits.filter(|((got, value), expected)| {
-                    got.to_bits() != **expected && !(**got == 0.0 && value.abs() < f32::MIN_POSITIVE)
-                });
-                assert_eq!(wrong.count(), 0, "{count} values, {set:?}");
+                for (&got, &value) in unpacked.iter().zip(&values) {
+                    // The instruction flushes values below the normal ones to zero.
+                    let is_flushed = got == 0.0 && value.abs() < f32::MIN_POSITIVE;
+                    let is_equal = got.to_bits() == bf16::from_f32(value).to_f32().to_bits();
+                    assert!(is_equal || is_flushed || got.is_nan() && value.is_nan(), "{value} gives {got}, {set:?}");
+                }
             }
-        }
-    }
-
-    #[test]
-    fn nan_stays_nan() {
-        for set in InstructionSet::available() {
-            let (mut packed, mut unpacked) = ([0.0], [0.0; 2]);
-            pack_bf16(set, &[f32::NAN, 1.0], &mut packed);
-            unpack_bf16(&packed, &mut unpacked);
-            assert!(unpacked[0].is_nan() && unpacked[1] == 1.0);
         }
     }
 }

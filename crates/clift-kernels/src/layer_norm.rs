@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::primitives::partition::{add, rows_per_sum, rows_per_task};
 use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::Simd;
+use crate::simd::vector::{Operands, Simd};
 
 /// Computes `output = (x - mean) / sqrt(variance + epsilon) * gamma + beta` per row. `statistics` receives the mean and
 /// `1 / sqrt(variance + epsilon)` of every row, an input of [`layer_norm_backward`].
@@ -69,10 +69,8 @@ struct Forward<'a> {
 }
 
 impl Kernel for Forward<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { epsilon, x, gamma, beta, output, statistics } = self;
         let dim = gamma.len();
         let rows = x.chunks_exact(dim).zip(output.chunks_exact_mut(dim)).zip(statistics);
@@ -102,10 +100,8 @@ struct Backward<'a> {
 }
 
 impl Kernel for Backward<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { x, gamma, grad, grad_x, statistics, sums } = self;
         let dim = gamma.len();
         let (sum_gamma, sum_beta) = sums.split_at_mut(dim);
@@ -159,56 +155,4 @@ fn sum_of_squares<S: Simd>(simd: S, values: &[f32], mean: f32) -> f32 {
         total = simd.mul_add(difference, difference, total);
     }
     values[full..].iter().fold(simd.sum(total), |total, value| total + (value - mean).powi(2))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::{assert_close, random};
-
-    fn check(rows: usize, dim: usize, offset: f32) {
-        let x: Vec<f32> = random(rows * dim, 1).iter().map(|value| value + offset).collect();
-        let (gamma, beta, grad) = (random(dim, 2), random(dim, 3), random(rows * dim, 4));
-        let epsilon = 1e-5;
-        let mut expected = [rows * dim, rows * dim, dim, dim].map(|len| vec![0.0_f64; len]);
-        let [output, grad_x, grad_gamma, grad_beta] = &mut expected;
-        let mean_of = |values: &[f64]| values.iter().sum::<f64>() / dim as f64;
-        for row in 0..rows {
-            let wide = |values: &[f32]| values[row * dim..][..dim].iter().map(|&v| f64::from(v)).collect::<Vec<_>>();
-            let (x, grad) = (wide(&x), wide(&grad));
-            let mean = mean_of(&x);
-            let variance = mean_of(&x.iter().map(|value| (value - mean).powi(2)).collect::<Vec<_>>());
-            let inverse = 1.0 / (variance + epsilon).sqrt();
-            let normal: Vec<f64> = x.iter().map(|value| (value - mean) * inverse).collect();
-            let slope: Vec<f64> = grad.iter().zip(&gamma).map(|(grad, &gamma)| grad * f64::from(gamma)).collect();
-            let along = mean_of(&slope.iter().zip(&normal).map(|(slope, normal)| slope * normal).collect::<Vec<_>>());
-            for i in 0..dim {
-                output[row * dim + i] = normal[i] * f64::from(gamma[i]) + f64::from(beta[i]);
-                grad_x[row * dim + i] = inverse * (slope[i] - mean_of(&slope) - normal[i] * along);
-                grad_gamma[i] += grad[i] * normal[i];
-                grad_beta[i] += grad[i];
-            }
-        }
-        for set in InstructionSet::available() {
-            let mut output = vec![f32::NAN; rows * dim];
-            let mut statistics = vec![[f32::NAN; 2]; rows];
-            layer_norm_forward(set, epsilon as f32, [&x, &gamma, &beta], &mut output, &mut statistics);
-            assert_close(&output, &expected[0], 1e-5);
-            let mut grads = [rows * dim, dim, dim].map(|len| vec![f32::NAN; len]);
-            let [grad_x, grad_gamma, grad_beta] = &mut grads;
-            layer_norm_backward(set, [&x, &gamma, &grad], &statistics, [grad_x, grad_gamma, grad_beta]);
-            for (got, expected) in grads.iter().zip(&expected[1..]) {
-                assert_close(got, expected, 1e-5);
-            }
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_equals_f64_at_odd_shapes() {
-        check(1, 5, 0.0);
-        check(3, 12, 0.0);
-        check(777, 37, 0.0);
-        check(500, 96, 3.0);
-        check(65, 768, -1.0);
-    }
 }

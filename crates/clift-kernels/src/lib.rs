@@ -1,23 +1,8 @@
 //! CPU kernels of clift on f32 slices, forward and backward, without Burn.
 //!
-//! Every kernel is written once and compiled for every [`InstructionSet`]; the set is chosen at run time. Sums are
+//! Every kernel is written once and compiled for every [`InstructionSet`]; the widest of the processor runs. Sums are
 //! divided by shape alone, so that results do not depend on the number of threads. Tensors of other types than f32 take
 //! the composed operations of `clift-model`.
-//!
-//! ```
-//! use clift_kernels::{InstructionSet, linear_forward, sum_rows};
-//!
-//! let [rows, inputs, outputs] = [2, 3, 1];
-//! let (x, weight, bias) = ([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 0.0, -1.0], [0.5]);
-//! let mut output = [0.0; 2];
-//! linear_forward([rows, inputs, outputs], [&x, &weight, &bias], &mut output);
-//! assert_eq!(output, [-1.5, -1.5]);
-//!
-//! // The gradient of the bias under an output gradient of ones.
-//! let mut grad_bias = [0.0];
-//! sum_rows(InstructionSet::detected(), &[1.0, 1.0], &mut grad_bias);
-//! assert_eq!(grad_bias, [2.0]);
-//! ```
 
 #![expect(clippy::inline_always, reason = "only code inlined into a kernel is compiled with the kernel's instructions")]
 
@@ -36,15 +21,15 @@ mod simd;
 mod testing;
 
 // Choice of the instruction set
-pub use simd::dispatch::{InstructionSet, InstructionSetError, OperandType};
+pub use simd::dispatch::{InstructionSet, OperandType};
 // The bound of every product
 pub use simd::peak::peak_flops;
 // Values in bf16
 pub use bf16_values::{pack_bf16, unpack_bf16};
 // Softmax attention
-pub use attention::backward::{BackwardInputs, attention_backward};
+pub use attention::backward::attention_backward;
 pub use attention::forward::attention_forward;
-pub use attention::shapes::{AttentionGradients, AttentionSizes, StridedRows};
+pub use attention::shapes::{AttentionSizes, StridedRows};
 // Attention inside clusters
 pub use cluster_attention::{ClusterSegments, cluster_attention_backward, cluster_attention_forward};
 // Camera-relative attention

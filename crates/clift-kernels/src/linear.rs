@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::primitives::partition::{add, rows_per_sum, rows_per_task};
 use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::Simd;
+use crate::simd::vector::{Operands, Simd};
 
 /// Fewest multiply-accumulates that are divided among threads.
 const PARALLEL: usize = 1 << 20;
@@ -68,50 +68,11 @@ struct SumRows<'a> {
 }
 
 impl Kernel for SumRows<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         for x in self.x.chunks_exact(self.to.len()) {
             for (x, to) in x.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {
                 simd.write(to, simd.add(simd.read(to), simd.read(x)));
-            }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::{assert_close, random};
-
-    #[test]
-    fn results_equal_f64() {
-        for [rows, inputs, outputs] in [[1, 1, 1], [3, 5, 7], [70, 33, 129], [1, 768, 5], [130, 96, 90]] {
-            let (x, weight, bias) = (random(rows * inputs, 1), random(inputs * outputs, 2), random(outputs, 3));
-            let expected: Vec<f64> = (0..rows * outputs)
-                .map(|i| {
-                    let (row, column) = (i / outputs, i % outputs);
-                    let product = |j: usize| f64::from(x[row * inputs + j]) * f64::from(weight[j * outputs + column]);
-                    f64::from(bias[column]) + (0..inputs).map(product).sum::<f64>()
-                })
-                .collect();
-            let mut output = vec![f32::NAN; rows * outputs];
-            linear_forward([rows, inputs, outputs], [&x, &weight, &bias], &mut output);
-            assert_close(&output, &expected, 1e-5);
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_sums_rows_as_f64() {
-        for [rows, dim] in [[1, 5], [3, 12], [777, 37], [500, 96], [65, 768]] {
-            let x = random(rows * dim, 4);
-            let column = |c: usize| x.iter().skip(c).step_by(dim).map(|&value| f64::from(value)).sum();
-            let expected: Vec<f64> = (0..dim).map(column).collect();
-            for set in InstructionSet::available() {
-                let mut sums = vec![f32::NAN; dim];
-                sum_rows(set, &x, &mut sums);
-                assert_close(&sums, &expected, 1e-5);
             }
         }
     }

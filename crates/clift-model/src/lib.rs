@@ -27,19 +27,6 @@
 //! assert_eq!(image.dims(), [1, 1, 16, 16, 3]);
 //! # Ok::<(), clift_model::ModelError>(())
 //! ```
-//!
-//! The metrics work on plain slices, `[height, width, 3]`:
-//!
-//! ```
-//! use clift_model::{psnr, ssim};
-//!
-//! let (height, width) = (16, 16);
-//! let target = vec![0.5; height * width * 3];
-//! let rendering: Vec<f32> = target.iter().map(|value| value + 0.1).collect();
-//! assert!((psnr(&rendering, &target)? - 20.0).abs() < 1e-3);
-//! assert!(ssim(&rendering, &target, height, width)? > 0.9);
-//! # Ok::<(), clift_model::ModelError>(())
-//! ```
 #![cfg_attr(
     feature = "ndarray",
     expect(
@@ -66,13 +53,10 @@ pub use error::ModelError;
 pub use names::{parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
-pub use device::adapter::{
-    ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes, product_instructions, used_adapter,
-};
+pub use device::adapter::{ADAPTER_VARIABLE, Adapter, adapters, max_tensor_bytes, product_instructions, used_adapter};
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras
-pub use views::patch::{patchify, unpatchify};
 pub use views::patch_grids::PatchGrids;
 pub use views::rays::RayFrame;
 pub use views::rays::plucker;
@@ -88,25 +72,17 @@ pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 // Networks
 pub use network::architecture::{Architecture, CameraEncoding, CliftVariant};
-pub use network::camera_encoding::TokenTransforms;
+pub use network::condenser::Condenser;
 pub use network::config::{CondenserConfig, ModelConfig};
-pub use network::init::Init;
+pub use network::encoder::Encoder;
 pub use network::model::Network;
-pub use network::parts::condenser::Condenser;
-pub use network::parts::encoder::Encoder;
-pub use network::parts::renderer::Renderer;
-pub use network::pass::{Pass, PassState, TokenStep};
 pub use network::render_tokens::{KeyValueCache, RenderTokens};
+pub use network::renderer::Renderer;
 pub use network::tokens::Tokens;
-// Layers and operations of the networks
-pub use network::blocks::attention::SelfAttention;
-pub use network::blocks::block::{DecoderBlock, EncoderBlock};
-pub use network::blocks::feed_forward::{Activation, FeedForward};
-pub use network::blocks::norms::LiftNorm;
-pub use ops::attention::{cross_sdpa, self_sdpa};
+// Operations of the networks
+pub use ops::attention::cross_sdpa;
 pub use ops::cluster_attention::cluster_attention;
-pub use ops::composed::attention::MAX_SCORES;
-pub use ops::linear::{gelu_linear, linear, norm_linear};
+pub use ops::linear::linear;
 pub use ops::matmul::{matmul_without_gradient, peak_flops};
 pub use ops::optimizer::{AdamWFactors, fused_adamw, fused_gradient_norm};
 // Parameters, multiply-accumulates and memory of a network
@@ -120,7 +96,7 @@ pub use network::layers::Part;
 pub use metrics::image_metrics::{SSIM_MIN_SIZE_PX, check_images, psnr, psnr_of_mse, sharpness, ssim};
 pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
 pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
-pub use metrics::vgg::{Pooling, VggShape, VggSizes};
+pub use metrics::vgg::VggShape;
 // Weight files and trained models
 pub use weights::file::{
     first_not_f32, load_adapted, load_part, save_part, save_part_f16, save_weights, sorted_header,
@@ -128,9 +104,7 @@ pub use weights::file::{
 pub use weights::hash::{renderer_hash, weights_hash};
 pub use weights::model_path::{ModelPath, check_condenser, check_sizes, refuse_checkpoint};
 pub use weights::network_adapter::NetworkAdapter;
-pub use weights::published_keys::{
-    PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
-};
+pub use weights::published_keys::{PERCEPTUAL_PREFIX, PREFIX, PublishedTensor, canonical_key, published_tensors};
 pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::shipped_model::{SHIPPED_MODEL, find_shipped, is_shipped};
 pub use weights::trained_model::{TrainedModel, open_renderer};

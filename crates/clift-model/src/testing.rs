@@ -1,8 +1,10 @@
 //! Devices, fixtures, gradient checks and comparisons for the unit tests.
 
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
+use clift_kernels::InstructionSet;
 use safetensors::{Dtype, SafeTensors};
 
 use crate::device::name::DeviceName;
@@ -30,21 +32,19 @@ pub fn small_config(variant: CliftVariant) -> ModelConfig {
     }
 }
 
-/// Returns the small network of LVSM's paper or of `CLiFT`'s release.
-pub fn small_lvsm(variant: CliftVariant) -> ModelConfig {
+pub fn small_lvsm() -> ModelConfig {
     let condenser = CondenserConfig::NONE;
-    ModelConfig { architecture: Architecture::LvsmEd, num_latents: 7, condenser, ..small_config(variant) }
+    let clift = small_config(CliftVariant::Paper);
+    ModelConfig { architecture: Architecture::LvsmEd, num_latents: 7, condenser, ..clift }
 }
 
-/// Returns [`small_config`] of all variants, and of the paper without residuals, and [`small_lvsm`] of both variants.
+/// Returns [`small_config`] of all variants, and of the paper without residuals, and [`small_lvsm`].
 pub fn small_configs() -> Vec<ModelConfig> {
     let mut literal = small_config(CliftVariant::Paper);
     literal.condenser.residual = false;
-    let lvsm = [CliftVariant::Paper, CliftVariant::ReleasedRe10k].map(small_lvsm);
-    CliftVariant::ALL.map(small_config).into_iter().chain([literal]).chain(lvsm).collect()
+    CliftVariant::ALL.map(small_config).into_iter().chain([literal, small_lvsm()]).collect()
 }
 
-/// Returns the values in f64, row-major.
 pub fn to_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
     tensor.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64 after conversion")
 }
@@ -148,49 +148,42 @@ pub fn output_and_gradients<const COUNT: usize>(
     (output.inner(), gradients)
 }
 
-/// Asserts that output and gradients of `f` equal those of `expected`, to `tolerance` of the largest expected value.
-#[track_caller]
-pub fn check_equal<const COUNT: usize>(
-    inputs: [Tensor<3>; COUNT],
-    cotangent: Tensor<3>,
-    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
-    expected: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
-    tolerance: f64,
-) {
-    let (output, grads) = output_and_gradients(inputs.clone(), cotangent.clone(), f);
-    let (expected, expected_grads) = output_and_gradients(inputs, cotangent, expected);
-    assert_close(&output, &expected, tolerance);
-    for (grad, expected) in grads.iter().zip(&expected_grads) {
-        assert_close(grad, expected, tolerance);
-    }
-}
-
-/// Asserts that no gradient is infinite or NaN.
 #[track_caller]
 pub fn assert_finite<const COUNT: usize>(grads: [Tensor<3>; COUNT]) {
     assert!(grads.into_iter().all(|grad| grad.is_finite().all().into_scalar::<bool>()));
 }
 
-/// Asserts that output and gradients of `f` in f32 (native kernels on flex) equal the results in f64 (composed
-/// operations). Results that are zero in f64 are not compared.
+thread_local! {
+    /// Instruction set of native kernels that this thread calls, in place of the widest.
+    pub static INSTRUCTION_SET: Cell<Option<InstructionSet>> = const { Cell::new(None) };
+}
+
+/// Asserts that output and gradients of `f` in f32, by native kernels of flex with every instruction set of this machine in
+/// turn, equal the results in f64 (composed operations), to `tolerance` of the largest entry. Gradients that are zero in f64
+/// are zero to `tolerance`.
 #[track_caller]
 pub fn check_native<const COUNT: usize>(
     inputs: [Tensor<3>; COUNT],
-    cotangent: Tensor<3>,
     f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
     tolerance: f64,
 ) {
     let inputs = inputs.map(|input| input.cast(DType::F32));
-    let cotangent = cotangent.cast(DType::F32);
-    let (output, grads) = output_and_gradients(inputs.clone(), cotangent.clone(), &f);
-    let wide = inputs.map(|input| input.cast(DType::F64));
-    let (expected, expected_grads) = output_and_gradients(wide, cotangent.cast(DType::F64), &f);
-    assert_close(&output.cast(DType::F64), &expected, tolerance);
-    for (grad, expected) in grads.into_iter().zip(&expected_grads) {
-        if expected.clone().abs().max().into_scalar::<f64>() > 1e-12 {
-            assert_close(&grad.cast(DType::F64), expected, tolerance);
+    let wide = inputs.clone().map(|input| input.cast(DType::F64));
+    let cotangent = random(f(wide.clone()).dims(), 99, &inputs[0].device()).cast(DType::F32);
+    let (expected, expected_grads) = output_and_gradients(wide, cotangent.clone().cast(DType::F64), &f);
+    for set in InstructionSet::available() {
+        INSTRUCTION_SET.set(Some(set));
+        let (output, grads) = output_and_gradients(inputs.clone(), cotangent.clone(), &f);
+        assert_close(&output.cast(DType::F64), &expected, tolerance);
+        for (grad, expected) in grads.into_iter().zip(&expected_grads) {
+            if expected.clone().abs().max().into_scalar::<f64>() > 1e-12 {
+                assert_close(&grad.cast(DType::F64), expected, tolerance);
+            } else {
+                assert!(grad.abs().max().into_scalar::<f32>() < tolerance as f32, "a gradient of zero");
+            }
         }
     }
+    INSTRUCTION_SET.set(None);
 }
 
 /// Asserts that the gradients of `f` under a random cotangent equal central differences in f64, to `tolerance` of the
@@ -226,18 +219,6 @@ pub fn check_gradients<const COUNT: usize>(
             assert!((a - n).abs() <= tolerance * scale, "input {position}, entry {index}: {a} against {n}");
         }
     }
-}
-
-/// Casts the parameters of a module to f64.
-pub fn to_f64<M: burn::module::Module>(module: M) -> M {
-    use burn::module::{ModuleMapper, Param};
-    struct ToF64;
-    impl ModuleMapper for ToF64 {
-        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-            Param::from_tensor(param.val().cast(DType::F64))
-        }
-    }
-    module.map(&mut ToF64)
 }
 
 /// Loads the tensors of a fixture whose names start with `prefix` into a module, in PyTorch's layout; asserts that every

@@ -5,13 +5,12 @@
 //! [`Scene::write_coded`] with the [`TokenCodec`] of the model, which [`fit_codec`] fits on training scenes.
 //! [`SceneRenderer`] renders views, and [`CheckedView`] compares a rendering with a photo.
 //!
-//! The example `encode_and_render` encodes a folder of photos and renders a view; `read_scene` prints a scene file.
+//! The example `encode_and_render` encodes a folder of photos and renders a view.
 
 mod check;
 mod codec;
 mod encode;
 mod error;
-mod fit;
 mod scene;
 mod tensors;
 #[cfg(test)]
@@ -20,33 +19,20 @@ mod testing;
 // Errors
 pub use error::SceneError;
 // Encode images
-pub use encode::cluster_map::ClusterMap;
-pub use encode::coding::Coding;
-pub use encode::contexts::Contexts;
+pub use encode::contexts::{ContextChoice, Contexts, EncodeOptions};
 pub use encode::encode::{EncodedScene, encode};
 pub use encode::encode_scene::{SceneOptions, WrittenScene, encode_scene};
 pub use encode::names::{find_scene, frame_positions};
-pub use encode::options::{ContextChoice, EncodeOptions};
 pub use encode::photo_size::photo_size;
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::frame_size::check_frames;
-pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{ContextGroup, Scene, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, load_renderer};
-pub use scene::token_coding::{CodedLoss, TokenCoding};
-pub use scene::token_format::TokenFormat;
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, frame_bytes, frames_per_call, load_renderer};
+pub use scene::token_coding::{CodedLoss, TokenCoding, TokenFormat};
 pub use scene::write::check_output_path;
 // A check of a scene, and the baselines of renderings
-pub use check::baselines::{mean_image, nearest_image, view_image};
-pub use check::view_check::{CheckedView, MIN_CONTEXT_PSNR};
+pub use check::{CheckedView, MIN_CONTEXT_PSNR, mean_image, nearest_image, view_image};
 // The coder of tokens in scene files
-pub use codec::histogram::{Distributions, Histograms};
-pub use codec::prediction::{NeighbourProducts, Places, Prediction};
-pub use codec::rates::RateTable;
-pub use codec::token_codec::{LevelCounts, TokenCodec};
-pub use codec::transform::{Moments, Transform};
-// The token codec of a model
-pub use fit::fit::{CodecOptions, FittedCodec, fit_codec};
-pub use fit::progress::FitProgress;
-pub use fit::step_choice::{expected_step, step_for_bytes, step_for_loss};
+pub use codec::fit::{CodecOptions, fit_codec};
+pub use codec::token_codec::TokenCodec;

@@ -1,4 +1,4 @@
-//! Reads the tensors of a safetensors file, which may be damaged or hostile.
+//! Numbers of files as little-endian bytes, and the tensors of a safetensors file, which may be damaged or hostile.
 
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
@@ -27,17 +27,31 @@ impl Tensors<'_> {
     }
 
     pub fn f64s(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>, String> {
-        let data = self.data(name, Dtype::F64, shape)?;
-        Ok(data.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect())
+        Ok(numbers(&self.data(name, Dtype::F64, shape)?, f64::from_le_bytes))
     }
 
     pub fn f32s(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, String> {
-        let data = self.data(name, Dtype::F32, shape)?;
-        Ok(data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
+        Ok(numbers(&self.data(name, Dtype::F32, shape)?, f32::from_le_bytes))
     }
 
     pub fn u32s(&self, name: &str, shape: &[usize]) -> Result<Vec<u32>, String> {
-        let data = self.data(name, Dtype::U32, shape)?;
-        Ok(data.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect())
+        Ok(numbers(&self.data(name, Dtype::U32, shape)?, u32::from_le_bytes))
     }
+}
+
+/// Converts the numbers of `N` bytes each, such as with `f32::from_le_bytes`.
+pub(crate) fn numbers<const N: usize, T>(bytes: &[u8], from: fn([u8; N]) -> T) -> Vec<T> {
+    bytes.as_chunks().0.iter().map(|bytes| from(*bytes)).collect()
+}
+
+pub(crate) fn f64_bytes(values: impl IntoIterator<Item = f64>) -> Vec<u8> {
+    values.into_iter().flat_map(f64::to_le_bytes).collect()
+}
+
+pub(crate) fn f32_bytes(values: impl IntoIterator<Item = f32>) -> Vec<u8> {
+    values.into_iter().flat_map(f32::to_le_bytes).collect()
+}
+
+pub(crate) fn u32_bytes(values: impl IntoIterator<Item = u32>) -> Vec<u8> {
+    values.into_iter().flat_map(u32::to_le_bytes).collect()
 }

@@ -9,87 +9,64 @@ use clift_core::BadConfig;
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the message of a variant says what its fields are")]
 pub enum TrainError {
-    /// A file could not be opened, read or written.
     #[error("{action} failed: {source}: {path}", path = path.display())]
     Io { action: &'static str, source: std::io::Error, path: PathBuf },
-    /// A value of the configuration is invalid.
     #[error(transparent)]
     BadConfig(#[from] BadConfig),
-    /// The run directory contains a run with other settings.
     #[error(
-        "this run was started with other settings:\n{differences}\nresume with the old values, {or}set another `run_dir`, or \
+        "this run was started with other settings:\n{differences}\nresume with the old values, set another `run_dir`, or \
          start a new run with --fresh: {path}",
         path = path.display()
     )]
-    OtherRun { differences: String, or: &'static str, path: PathBuf },
-    /// The content of a file is invalid.
+    OtherRun { differences: String, path: PathBuf },
     #[error("bad {what}: {reason}: {path}", path = path.display())]
     BadFile { what: &'static str, reason: String, path: PathBuf },
-    /// The cluster cache was built with another encoder or other settings.
     #[error("stale cluster cache: {reason}; remove the cache to build a new one: {path}", path = path.display())]
     StaleClusters { reason: String, path: PathBuf },
-    /// Stage 2 was trained on another encoder than stage 1.
     #[error(
         "stage 2 was trained on another encoder than stage 1; remove stage2/ and clusters/ and train stage 2 again: \
          {path}",
         path = path.display()
     )]
     OtherEncoder { path: PathBuf },
-    /// A stage needs the result of a stage that has not run.
     #[error("{stage} needs {what}, not found at {path}; run `{first}` first", path = path.display())]
     Missing { stage: &'static str, what: &'static str, first: &'static str, path: PathBuf },
-    /// Too many consecutive steps were skipped.
     #[error(
         "skipped {count} consecutive steps, the last at step {step}: {reason} (scenes {keys}); all are listed in \
          bad_steps.jsonl; the last good checkpoint is {checkpoint}"
     )]
     Diverged { count: u32, step: u64, reason: String, keys: String, checkpoint: String },
-    /// A stage failed after it had saved its steps.
     #[error("{source}\n{stage} stopped after step {step}; the last good checkpoint is {checkpoint}")]
     Stopped { source: Box<TrainError>, stage: &'static str, step: u64, checkpoint: String },
-    /// A checkpoint cannot be read.
     #[error("{source}\nthe newest checkpoint is damaged: {fix}")]
     Damaged { source: Box<TrainError>, fix: String },
-    /// Another process uses the run directory or the output folder.
     #[error("{what} {path} is in use by {holder}; wait until it exits or set {elsewhere}", path = path.display())]
     Locked { what: &'static str, holder: String, elsewhere: &'static str, path: PathBuf },
-    /// The run directory was moved or removed while the run was training.
     #[error("the run directory was moved or removed during training; resume at its new place with --set run_dir: {path}", path = path.display())]
     Moved { path: PathBuf },
-    /// No scene is left to train or evaluate on.
     #[error("no usable scene: {reason}")]
     NoScenes { reason: String },
-    /// The run was interrupted and has saved its steps.
     #[error("interrupted at step {step}; the same command resumes")]
     Interrupted { step: u64 },
-    /// A task without intermediate results was interrupted.
     #[error("interrupted while {task}; no output files were written")]
     Abandoned { task: String },
-    /// Another rank of the run has failed.
     #[error("rank {rank} failed: {reason}")]
     OtherRank { rank: usize, reason: String },
-    /// Ranks that must agree differ.
     #[error(
         "{what} of rank {rank} differ from rank 0's; all ranks need the same program, config and data, and a run directory on \
          a file system that they share"
     )]
     RanksDiffer { what: &'static str, rank: usize },
-    /// A launcher started several processes that cannot be connected.
     #[error("a launcher started {num_ranks} processes, and {reason}")]
     NoMpi { num_ranks: usize, reason: String },
-    /// A device failed.
     #[error("the device failed: {reason}")]
     Device { reason: String },
-    /// Scenes could not be read.
     #[error(transparent)]
     Data(#[from] clift_data::DataError),
-    /// Input or weights of the model are invalid.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
-    /// Coding tokens failed.
     #[error(transparent)]
     Scene(#[from] clift_scene::SceneError),
-    /// Evaluation failed.
     #[error(transparent)]
     Eval(#[from] clift_eval::EvalError),
 }

@@ -3,10 +3,8 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_eval::{EvalError, EvalProgress, Process, SharedScenes};
+use clift_eval::EvalProgress;
 use serde::{Deserialize, Serialize};
-
-use crate::distributed::ranks::Ranks;
 
 /// A training stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
@@ -64,9 +62,6 @@ pub struct StepEvent {
     /// Last step of the stage.
     #[serde(skip)]
     pub last_step: u64,
-    /// Last step whose images have the size of this one's; the last step of the stage, where they all have one size.
-    #[serde(skip)]
-    pub last_step_of_size: u64,
     /// Training loss of the batch.
     pub loss: f64,
     /// PSNR of the batch in dB.
@@ -87,17 +82,14 @@ pub struct StepEvent {
 #[derive(Clone, Debug, PartialEq)]
 #[expect(missing_docs, reason = "the fields are described with their variants")]
 pub enum Event {
-    /// Chunks of a data set were examined for its filters.
-    Scan { done: usize, total: usize },
     /// A step of the run starts, or resumes at a checkpoint. The cluster cache has context sets as its steps.
     StepStarted { run_step: RunStep, done: u64, num_steps: u64 },
-    /// The following steps of a stage have images of this size, columns and rows, where a stage has images of two sizes.
-    ImageSize { stage: Stage, size: [usize; 2], done: u64, last_step_of_size: u64, last_step: u64 },
     /// An update was made.
     Step(StepEvent),
-    /// The first steps of a new stage were measured: mean wall time of a step with its batch, without the first step, and peak
-    /// memory of the process, `None` if the system does not report it.
-    Pace { stage: Stage, step: u64, last_step_of_size: u64, last_step: u64, step_s: f64, peak_bytes: Option<u64> },
+    /// The first steps of a new stage were measured: mean wall time of a step with its batch, without the first step.
+    Pace { stage: Stage, step: u64, step_s: f64 },
+    /// Chunks of a data set were examined, of all that are.
+    Scan { done: usize, total: usize },
     /// A context set of the cluster cache or a scene of an evaluation was processed.
     Progress { run_step: RunStep, done: u64, total: u64 },
     /// Validation views were measured. SSIM is `None` for images below 11 pixels.
@@ -130,8 +122,6 @@ impl<F: FnMut(&Event)> Sink for F {
 pub(crate) struct EvalEvents<'a> {
     pub stop: &'a AtomicBool,
     pub sink: &'a mut dyn Sink,
-    /// Ranks that share the scenes.
-    pub ranks: &'a Ranks,
     /// Whether scenes are counted: in an evaluation, not in a validation.
     pub is_stage: bool,
 }
@@ -156,13 +146,5 @@ impl EvalProgress for EvalEvents<'_> {
 
     fn is_interrupted(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
-    }
-
-    fn process(&self) -> Process {
-        Process { rank: self.ranks.rank(), count: self.ranks.num_ranks() }
-    }
-
-    fn gather(&mut self, own: SharedScenes) -> Result<Vec<SharedScenes>, EvalError> {
-        self.ranks.gather(own).map_err(|error| EvalError::OtherProcess { reason: error.to_string() })
     }
 }

@@ -1,32 +1,28 @@
 //! The token codec of a run or model, fitted after stage 2 or on demand.
 
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
 use clift_core::derive_seed;
 use clift_data::{ClipReader, plural};
 use clift_eval::{EvalConfig, EvalError, EvalFrames, EvalSplit, evaluation_items};
 use clift_model::{Grouping, ModelPath, TrainedModel};
-use clift_scene::{CodecOptions, FitProgress, FittedCodec, SceneError, TokenCodec, fit_codec};
+use clift_scene::{CodecOptions, SceneError, TokenCodec, fit_codec};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
 
 /// Fits the token codec of a model on training scenes, with the token counts and views of `config.eval`, and writes the
-/// codec beside the weights.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] for a run on tiles, whose tokens no scene file stores, and for a network without
-/// clusters; those of the fit.
+/// codec beside the weights. Returns the number of scenes that it was fitted on.
 pub fn fit_token_codec(
     config: &Config,
     model: (&TrainedModel, &Path),
     (reader, frames): (&ClipReader, EvalFrames),
     stop: &AtomicBool,
     sink: &mut dyn Sink,
-) -> Result<FittedCodec, TrainError> {
+) -> Result<usize, TrainError> {
     let (model, weights) = model;
     if !config.model.architecture.supports_clusters() {
         let fix = "the token codec is one of condensed tokens; those of this network are stored in f32, f16 or int8";
@@ -51,28 +47,10 @@ pub fn fit_token_codec(
         kmeans: config.clusters.kmeans.clone(),
         seed: derive_seed(config.seed, "codec"),
     };
-    let mut progress = FitEvents { stop, sink };
-    let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
-    fitted.codec.write(&TokenCodec::path_of(weights))?;
-    Ok(fitted)
-}
-
-/// Reports skipped scenes as events of a run.
-struct FitEvents<'a> {
-    stop: &'a AtomicBool,
-    sink: &'a mut dyn Sink,
-}
-
-impl FitProgress for FitEvents<'_> {
-    fn done(&mut self, _scenes: usize, _total: usize) {}
-
-    fn skipped(&mut self, key: &str, reason: &str) {
-        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
-    }
-
-    fn is_interrupted(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
-    }
+    let mut skipped = |key: &str, reason: &str| sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
+    let (codec, num_scenes) = fit_codec(model, reader, &items, &options, stop, &mut skipped)?;
+    codec.write(&TokenCodec::path_of(weights))?;
+    Ok(num_scenes)
 }
 
 /// Fits the codec of a run that has none of its weights. Scenes without views leave the run without a codec.
@@ -95,7 +73,7 @@ pub(crate) fn ensure_codec(
     // Held-out frames are not in the reader.
     let data = (training, EvalFrames::whole(EvalSplit::Train));
     match fit_token_codec(config, (&model, weights), data, stop, sink) {
-        Ok(FittedCodec { num_scenes, .. }) => {
+        Ok(num_scenes) => {
             sink.event(&Event::Message(format!("token codec: fitted on {}", plural(num_scenes, "training scene"))));
             Ok(())
         }

@@ -16,8 +16,6 @@
 //! println!("{:?}", summary.map(|summary| summary.points));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
-//!
-//! `examples/custom_loss.rs` makes single updates with [`TrainState`] and a loss term of its own.
 
 mod checkpoint;
 mod cluster_cache;
@@ -40,10 +38,8 @@ pub use config::config::{
     Algorithm, CheckpointConfig, ClustersConfig, Config, LossConfig, OptimizerConfig, Schedule, Stage1Config,
     Stage2Config,
 };
-pub use config::overrides::Override;
 pub use config::parse::{ConfigError, parse_config, read_checked_config, read_config};
 // Ranks of a run
-pub use distributed::communicator::Communicator;
 pub use distributed::launch::Launched;
 pub use distributed::machine::RankPlace;
 pub use distributed::parts::BatchParts;
@@ -57,14 +53,13 @@ pub use run::evaluate_model::evaluate_model;
 pub use run::lock::RunLock;
 pub use run::run::Run;
 pub use run::run_file::{RunOptions, lock_run};
-pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{BatchTokens, StageBatch};
 pub use step::device_batch::{DeviceBatch, render_loss};
-pub use step::loss::{Loss, LossParts, LossTerm, Rendering, mse};
+pub use step::loss::{Loss, LossParts, Rendering, mse};
 pub use step::loss_scale::LossScale;
-pub use step::optimizer::{StageOptimizer, clip_factor, global_norm};
+pub use step::optimizer::StageOptimizer;
 pub use step::schedule::learning_rate;
 pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};
@@ -74,13 +69,13 @@ pub use checkpoint::newest::NewestCheckpoint;
 pub use checkpoint::progress::TrainingPosition;
 pub use cluster_cache::cache::ClusterCache;
 // Published checkpoints
-pub use interchange::export::{ExportFormat, Exported, export};
-pub use interchange::import::import;
+pub use interchange::export::export_f16;
+pub use interchange::import::{ImportRecord, import};
 pub use interchange::model_dir::require_absent;
-pub use interchange::record::{ImportOptions, ImportRecord};
-// Memory and sizes of a run
-pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
+// Memory, sizes and speed of a run
+pub use footprint::estimate::{RunEstimate, estimate_run};
+pub use footprint::largest_tensor::largest_tensor;
 pub use footprint::memory::memory_warning;
-pub use footprint::plan::{PartPlan, Plan, RunEstimate, check_plan, estimate_run, plan};
+pub use footprint::plan::{PartPlan, Plan, check_plan, plan};
 // Seeded inputs for tests and benchmarks
 pub use step::seeded_inputs::{ClipShape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};

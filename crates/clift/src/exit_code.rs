@@ -1,8 +1,11 @@
 //! Error messages and exit codes.
 
+use std::error::Error;
+
 use clift_core::BadConfig;
 use clift_data::DataError;
 use clift_eval::EvalError;
+use clift_model::ModelError;
 use clift_scene::SceneError;
 use clift_train::{ConfigError, TrainError};
 use clift_view::ViewError;
@@ -42,130 +45,76 @@ macro_rules! usage_bail {
 pub(crate) use usage_bail;
 
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
-    if error.is::<UsageError>() || error.is::<ConfigError>() || error.is::<BadConfig>() {
-        return USAGE;
-    }
-    if error.is::<Interrupted>() {
-        return interrupt::exit_code();
-    }
-    if let Some(error) = error.downcast_ref::<DataError>() {
-        return data_exit_code(error);
-    }
-    if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
-        return model_exit_code(error);
-    }
-    if let Some(error) = error.downcast_ref::<EvalError>() {
-        return eval_exit_code(error);
-    }
-    if let Some(error) = error.downcast_ref::<SceneError>() {
-        return scene_exit_code(error);
-    }
-    if let Some(error) = error.downcast_ref::<ViewError>() {
-        return view_exit_code(error);
-    }
-    error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
+    error.chain().find_map(code_of).unwrap_or(FAILED)
 }
 
-fn train_exit_code(error: &TrainError) -> u8 {
-    match error {
-        TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
-        TrainError::BadConfig(_)
-        | TrainError::OtherRun { .. }
-        | TrainError::Missing { .. }
-        | TrainError::NoMpi { .. } => USAGE,
-        TrainError::Eval(error) => eval_exit_code(error),
-        TrainError::Scene(error) => scene_exit_code(error),
-        TrainError::Data(error) => data_exit_code(error),
-        TrainError::Model(error) => model_exit_code(error),
-        TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => train_exit_code(source),
-        _ => FAILED,
-    }
-}
-
-fn data_exit_code(error: &DataError) -> u8 {
-    if matches!(error, DataError::BadConfig(_) | DataError::BadOutput { .. } | DataError::UnknownLayout { .. }) {
+/// Returns the exit code of an error, or of the one that it passes on; `None` for an error of another library.
+fn code_of(error: &(dyn Error + 'static)) -> Option<u8> {
+    let code = if error.is::<UsageError>() || error.is::<ConfigError>() || error.is::<BadConfig>() {
         USAGE
+    } else if error.is::<Interrupted>() {
+        interrupt::exit_code()
+    } else if let Some(error) = error.downcast_ref::<TrainError>() {
+        match error {
+            TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
+            TrainError::BadConfig(_)
+            | TrainError::OtherRun { .. }
+            | TrainError::Missing { .. }
+            | TrainError::NoMpi { .. } => USAGE,
+            TrainError::Eval(error) => code_of(error)?,
+            TrainError::Scene(error) => code_of(error)?,
+            TrainError::Data(error) => code_of(error)?,
+            TrainError::Model(error) => code_of(error)?,
+            TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => code_of(source.as_ref())?,
+            _ => FAILED,
+        }
+    } else if let Some(error) = error.downcast_ref::<EvalError>() {
+        match error {
+            EvalError::Interrupted { .. } => interrupt::exit_code(),
+            EvalError::BadMethodName { .. } | EvalError::NotComparable { .. } => USAGE,
+            EvalError::Data(error) => code_of(error)?,
+            EvalError::Model(error) => code_of(error)?,
+            EvalError::Scene(error) => code_of(error)?,
+            _ => FAILED,
+        }
+    } else if let Some(error) = error.downcast_ref::<SceneError>() {
+        match error {
+            SceneError::BadRequest { .. } => USAGE,
+            SceneError::Interrupted { .. } => interrupt::exit_code(),
+            SceneError::Data(error) => code_of(error)?,
+            SceneError::Model(error) => code_of(error)?,
+            _ => FAILED,
+        }
+    } else if let Some(error) = error.downcast_ref::<ViewError>() {
+        match error {
+            ViewError::Bind { .. } => USAGE,
+            ViewError::Data(error) => code_of(error)?,
+            ViewError::Eval(error) => code_of(error)?,
+            ViewError::Scene(error) => code_of(error)?,
+            ViewError::Model(error) => code_of(error)?,
+            _ => FAILED,
+        }
+    } else if let Some(error) = error.downcast_ref::<DataError>() {
+        match error {
+            DataError::BadConfig(_) | DataError::BadOutput { .. } | DataError::UnknownLayout { .. } => USAGE,
+            _ => FAILED,
+        }
+    } else if let Some(error) = error.downcast_ref::<ModelError>() {
+        match error {
+            ModelError::BadConfig { .. }
+            | ModelError::BadTokenCount { .. }
+            | ModelError::BadWeights { .. }
+            | ModelError::NoCodec { .. }
+            | ModelError::NoConfig { .. }
+            | ModelError::NoDevice { .. }
+            | ModelError::NoModel { .. }
+            | ModelError::NotDivisible { .. }
+            | ModelError::NotImported { .. }
+            | ModelError::OtherRenderer { .. } => USAGE,
+            _ => FAILED,
+        }
     } else {
-        FAILED
-    }
-}
-
-fn eval_exit_code(error: &EvalError) -> u8 {
-    use EvalError::{BadMethodName, Interrupted, NoPredictions, NotComparable};
-    match error {
-        Interrupted { .. } => interrupt::exit_code(),
-        BadMethodName { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
-        EvalError::Data(error) => data_exit_code(error),
-        EvalError::Model(error) => model_exit_code(error),
-        EvalError::Scene(error) => scene_exit_code(error),
-        _ => FAILED,
-    }
-}
-
-fn scene_exit_code(error: &SceneError) -> u8 {
-    match error {
-        SceneError::BadRequest { .. } => USAGE,
-        SceneError::Interrupted { .. } => interrupt::exit_code(),
-        SceneError::Data(error) => data_exit_code(error),
-        SceneError::Model(error) => model_exit_code(error),
-        _ => FAILED,
-    }
-}
-
-fn view_exit_code(error: &ViewError) -> u8 {
-    match error {
-        ViewError::Bind { .. } => USAGE,
-        ViewError::Data(error) => data_exit_code(error),
-        ViewError::Eval(error) => eval_exit_code(error),
-        ViewError::Scene(error) => scene_exit_code(error),
-        ViewError::Model(error) => model_exit_code(error),
-        _ => FAILED,
-    }
-}
-
-fn model_exit_code(error: &clift_model::ModelError) -> u8 {
-    use clift_model::ModelError::{
-        BadConfig, BadTokenCount, BadWeights, NoCodec, NoConfig, NoDevice, NoModel, NotDivisible, NotImported,
-        OtherRenderer,
+        return None;
     };
-    match error {
-        BadConfig { .. }
-        | BadTokenCount { .. }
-        | BadWeights { .. }
-        | NoCodec { .. }
-        | NoConfig { .. }
-        | NoDevice { .. }
-        | NoModel { .. }
-        | NotDivisible { .. }
-        | NotImported { .. }
-        | OtherRenderer { .. } => USAGE,
-        _ => FAILED,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn cause_is_printed_once() {
-        let missing = clift_train::read_config::<clift_train::Config>("no.toml".as_ref(), &[]).unwrap_err();
-        let text = error_message(&anyhow::Error::from(missing).context("starting"));
-        assert!(text.starts_with("starting: reading the configuration failed: "), "{text}");
-        assert_eq!(text.matches("os error").count(), 1, "{text}");
-    }
-
-    #[test]
-    fn user_errors_and_failures_have_distinct_codes() {
-        let bad_config = || clift_data::SyntheticConfig { num_frames: 0, ..Default::default() }.validate();
-        assert_eq!(exit_code(&UsageError("no".into()).into()), USAGE);
-        assert_eq!(exit_code(&bad_config().unwrap_err().into()), USAGE);
-        assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), USAGE);
-        let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
-        assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), USAGE);
-        assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
-        assert_eq!(exit_code(&TrainError::Abandoned { task: "timing `encode`".into() }.into()), 130);
-        assert_eq!(exit_code(&DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
-        assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
-    }
+    Some(code)
 }

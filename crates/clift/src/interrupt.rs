@@ -4,7 +4,7 @@
 use std::io::{IsTerminal, stderr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::Context;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -15,7 +15,7 @@ use crate::verbosity::Verbosity;
 /// Offset of exit codes of signals, as in shells.
 const SIGNALLED: i32 = 128;
 /// Signals within this time after the first belong to it: GNU `timeout` signals the process and then its group.
-const REPEAT: Duration = Duration::from_secs(1);
+const REPEAT_MS: u64 = 1000;
 
 /// Number of the first signal; 0 for none.
 static FIRST_SIGNAL: AtomicI32 = AtomicI32::new(0);
@@ -48,8 +48,15 @@ pub fn flag(ending: Ending) -> anyhow::Result<Arc<AtomicBool>> {
     let started = Instant::now();
     let first_ms = Arc::new(AtomicU64::new(u64::MAX));
     let is_silent = Verbosity::chosen() == Verbosity::Silent;
-    // A terminal has `^C` and a progress bar in this line.
+    // A terminal has `^C` in this line.
     let start = if stderr().is_terminal() { "\n" } else { "" };
+    let print = move |text: &'static str| {
+        for text in [start, text].into_iter().filter(|_| !is_silent) {
+            // SAFETY: the pointer and the length are those of a string that lives as long as the process. The lock of the
+            // standard error is not taken: the interrupted thread may have it.
+            let _ = unsafe { libc::write(2, text.as_ptr().cast(), text.len() as _) };
+        }
+    };
     let listen = |signal: i32| {
         let (stop, first_ms) = (stop.clone(), first_ms.clone());
         let handle = move || {
@@ -58,15 +65,11 @@ pub fn flag(ending: Ending) -> anyhow::Result<Arc<AtomicBool>> {
                 Ok(_) => {
                     FIRST_SIGNAL.store(signal, Ordering::SeqCst);
                     stop.store(true, Ordering::SeqCst);
-                    if !is_silent {
-                        print([start, ending.first]);
-                    }
+                    print(ending.first);
                 }
-                Err(first_ms) if is_repeat(first_ms, now_ms) => {}
+                Err(first_ms) if now_ms.saturating_sub(first_ms) < REPEAT_MS => {}
                 Err(_) => {
-                    if !is_silent {
-                        print([start, ending.second]);
-                    }
+                    print(ending.second);
                     low_level::exit(SIGNALLED + signal)
                 }
             }
@@ -85,19 +88,6 @@ pub fn flag(ending: Ending) -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// Writes to the standard error without its lock, which the interrupted thread may have.
-fn print(texts: [&'static str; 2]) {
-    for text in texts {
-        // SAFETY: the pointer and the length are those of a string that lives as long as the process.
-        let _ = unsafe { libc::write(2, text.as_ptr().cast(), text.len() as _) };
-    }
-}
-
-/// Whether a signal belongs to the first one.
-fn is_repeat(first_ms: u64, now_ms: u64) -> bool {
-    Duration::from_millis(now_ms.saturating_sub(first_ms)) < REPEAT
-}
-
 /// Returns the exit code of an interrupted process: 128 plus the number of the first signal, or of Ctrl-C.
 pub fn exit_code() -> u8 {
     let signal = match FIRST_SIGNAL.load(Ordering::SeqCst) {
@@ -107,38 +97,12 @@ pub fn exit_code() -> u8 {
     (SIGNALLED + signal) as u8
 }
 
-/// Returns whether the process ignores a signal from its start, as `nohup` sets for SIGHUP. Linux only; `false` elsewhere.
+/// Returns whether the process ignores a signal from its start, as `nohup` sets for SIGHUP.
 #[cfg(unix)]
 fn is_ignored(signal: i32) -> bool {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    ignores(&status, signal)
-}
-
-#[cfg(unix)]
-fn ignores(status: &str, signal: i32) -> bool {
-    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
-}
-
-#[cfg(all(test, unix))]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn ignored_signals_are_read_from_the_mask() {
-        let status = "Name:\tclift\nSigBlk:\tffffffffffffffff\nSigIgn:\t0000000000001001\nSigCgt:\t0\n";
-        assert!(ignores(status, 1) && ignores(status, 13));
-        assert!(!ignores(status, 2) && !ignores("", 1));
-    }
-
-    #[test]
-    fn signals_within_a_second_are_repeats() {
-        assert!(is_repeat(5, 5) && is_repeat(5, 1004) && is_repeat(5, 4));
-        assert!(!is_repeat(5, 1005));
-    }
-
-    #[test]
-    fn exit_code_without_a_signal_is_that_of_ctrl_c() {
-        assert_eq!(exit_code(), 130);
+    // SAFETY: all bits zero is a valid `sigaction`, and the call only writes the present one to it.
+    unsafe {
+        let mut present: libc::sigaction = std::mem::zeroed();
+        libc::sigaction(signal, std::ptr::null(), &raw mut present) == 0 && present.sa_sigaction == libc::SIG_IGN
     }
 }

@@ -20,16 +20,14 @@ mod verbosity;
 
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser};
+use clap::Parser;
 use clift_eval::keep_freed_memory;
 use clift_train::Launched;
 
 use crate::cli::{Args, Command};
-use crate::commands::bench::cases::{BenchArgs, BenchCommand};
 use crate::commands::data::command::DataCommand;
 use crate::commands::{
-    bench, codec, compare, completions, data, doctor, encode, eval, export, flops, import, metrics, plan, render,
-    train, view,
+    bench, codec, compare, data, doctor, encode, eval, export, flops, import, metrics, plan, render, train, view,
 };
 use crate::exit_code::{DONE, error_message, exit_code};
 use crate::output::stdout;
@@ -61,26 +59,22 @@ fn run(args: Args) -> ExitCode {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Compare(args) => compare::run(&args),
-        Command::Completions(args) => completions::run(&args, Args::command()),
+        Command::Export(args) => export::run(&args),
         Command::Flops(args) => flops::run(&args),
         Command::Codec(args) => codec::run(&args),
         Command::Encode(args) => encode::run(&args),
-        Command::Render(args) => render::run::run(&args),
+        Command::Render(args) => render::run(&args),
         Command::View(args) => view::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Poses(args) } => data::poses::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
         Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),
         Command::Data { command: DataCommand::Index(args) } => data::index::run(&args),
-        Command::Data { command: DataCommand::Convert(args) } => data::convert::run(&args),
         Command::Metrics(args) => metrics::run(&args),
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run::run(&args),
-        Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => bench::data::run(&args),
-        Command::Bench(BenchArgs { command: Some(BenchCommand::Precision(args)), .. }) => bench::precision::run(&args),
-        Command::Bench(args) => bench::cases::run(&args),
+        Command::Bench(args) => bench::run(&args),
         Command::Import(args) => import::run(&args),
-        Command::Export(args) => export::run(&args),
     };
     match result {
         Ok(()) => ExitCode::from(DONE),

@@ -1,4 +1,4 @@
-//! Checks the help texts, and generates `docs/reference/config.md` from the doc comments and defaults of [`Config`]:
+//! Generates `docs/reference/config.md` from the doc comments and defaults of [`Config`]:
 //! `CLIFT_UPDATE=1 cargo test --release --workspace --lib page_is_current` rewrites the page.
 
 use std::collections::BTreeMap;
@@ -6,41 +6,11 @@ use std::fmt::Write;
 use std::fs;
 use std::path::Path;
 
-use clap::{Command, CommandFactory};
 use clift_train::Config;
 use toml::{Table, Value};
 
-use crate::cli::Args;
-
 /// Structs of the source files by name: doc comment, and name, type and doc comment of each public field.
 type Structs = BTreeMap<String, (String, Vec<[String; 3]>)>;
-
-fn compare(path: &str, text: &str) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path);
-    if std::env::var_os("CLIFT_UPDATE").is_some() {
-        fs::write(&path, text).expect("writable page");
-    }
-    let page = fs::read_to_string(&path).unwrap_or_default();
-    assert!(page == text, "{} is outdated; `CLIFT_UPDATE=1` rewrites the page", path.display());
-}
-
-/// Checks that the short help of every command and argument fits in a line of a terminal.
-#[test]
-fn short_help_fits_in_a_line() {
-    let mut command = Args::command();
-    command.build();
-    check_short_help(&command);
-}
-
-fn check_short_help(command: &Command) {
-    let arguments = command.get_arguments().map(|arg| (arg.get_id().as_str(), arg.get_help()));
-    for (name, help) in arguments.chain([(command.get_name(), command.get_about())]) {
-        let help = help.map(ToString::to_string).unwrap_or_default();
-        let short = help.split(['[', '\n']).next().unwrap_or_default().trim();
-        assert!(short.chars().count() <= 80 && !short.ends_with('.'), "{name}: {short}");
-    }
-    command.get_subcommands().for_each(check_short_help);
-}
 
 fn cell(text: &str) -> String {
     text.replace("\n\n", ". ").replace('\n', " ").replace('|', "\\|").replace('<', "\\<")
@@ -56,7 +26,12 @@ fn config_page_is_current() {
     let mut page =
         "# Config\n\nGenerated from the doc comments of `Config`. `--set KEY=TOML` overrides a key.\n".to_owned();
     add_section("", &structs["Config"].1, &defaults, &structs, &mut page);
-    compare("docs/reference/config.md", &page);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/reference/config.md");
+    if std::env::var_os("CLIFT_UPDATE").is_some() {
+        fs::write(&path, &page).expect("writable page");
+    }
+    let current = fs::read_to_string(&path).unwrap_or_default();
+    assert!(page == current, "{} is outdated; `CLIFT_UPDATE=1` rewrites the page", path.display());
 }
 
 fn read_structs(folder: &Path, structs: &mut Structs) {

@@ -1,4 +1,4 @@
-//! How much goes to the standard error: the options `--quiet` and `--verbose`.
+//! How much goes to the standard error: the option `--quiet`.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
@@ -11,26 +11,21 @@ pub enum Verbosity {
     /// Notes and progress, too.
     #[default]
     Normal = 1,
-    /// A line for every training step instead of a bar.
-    Verbose = 2,
     /// Nothing, errors included: rank 0 prints for all.
-    Silent = 3,
+    Silent = 2,
 }
 
 static CHOSEN: AtomicU8 = AtomicU8::new(Verbosity::Normal as u8);
 
 impl Verbosity {
-    /// Sets the verbosity of this process.
     pub fn choose(self) {
         CHOSEN.store(self as u8, Ordering::Relaxed);
     }
 
-    /// Returns the verbosity of this process.
     pub fn chosen() -> Self {
         match CHOSEN.load(Ordering::Relaxed) {
             0 => Self::Quiet,
-            2 => Self::Verbose,
-            3 => Self::Silent,
+            2 => Self::Silent,
             _ => Self::Normal,
         }
     }

@@ -16,7 +16,9 @@ static ALLOCATOR: Counting = Counting;
 
 fn take(bytes: usize) {
     if bytes > MOST_AT_ONCE {
-        crate::watch::give_up("asks for more memory at once than any file needs");
+        // Inside of an allocation, where nothing can unwind.
+        eprintln!("execution {} asks for more memory at once than any file needs", crate::number());
+        std::process::abort();
     }
     let in_use = IN_USE.fetch_add(bytes, Ordering::Relaxed) + bytes;
     PEAK.fetch_max(in_use, Ordering::Relaxed);
@@ -40,13 +42,6 @@ unsafe impl GlobalAlloc for Counting {
         IN_USE.fetch_sub(layout.size(), Ordering::Relaxed);
         // SAFETY: the caller's promise that the place came from here with this layout.
         unsafe { System.dealloc(place, layout) }
-    }
-
-    unsafe fn realloc(&self, place: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        take(size);
-        IN_USE.fetch_sub(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller's promise that the place came from here with this layout.
-        unsafe { System.realloc(place, layout, size) }
     }
 }
 

@@ -49,11 +49,6 @@ impl Setup {
     pub fn model(&self) -> Network {
         Network::new(&self.config.model, 1, &burn::tensor::Device::flex().autodiff())
     }
-
-    /// The newest checkpoint of stage 1.
-    pub fn checkpoint(&self) -> PathBuf {
-        self.at("run/stage1/checkpoints/step-000000006")
-    }
 }
 
 fn text(path: &Path) -> String {

@@ -1,118 +1,109 @@
 //! The table of readers.
 
-use crate::readers::{self, Read};
+use clift_data::{EvaluationIndex, TestScenes};
+use clift_scene::{Scene, TokenCodec};
+use clift_train::{Config, read_checked_config};
+
+use crate::readers::{self, CHUNK, CHUNK_INDEX, Read, done, file};
 use crate::setup::{Setup, fixture, member, read};
 use crate::words;
 
-type Seeds = fn(&Setup, &'static str) -> Vec<Vec<u8>>;
-type Open = fn(&Setup, &'static str) -> Read;
-
 pub struct Target {
     pub name: &'static str,
-    /// File that is damaged: a path below `data-fixtures` or in the run.
-    pub file: &'static str,
-    pub seeds: Seeds,
-    pub open: Open,
     /// Words of the format, see [`words::list`].
     pub words: &'static [u8],
+    /// Returns valid files and their reader.
+    pub open: Open,
     pub repair: fn(&mut [u8]),
     /// Most bytes of memory for an input of a length.
     pub most_bytes: fn(usize) -> usize,
 }
 
+type Open = fn(&Setup) -> (Vec<Vec<u8>>, Read);
+
 /// A reader without checksums that takes a fixed amount of memory and a multiple of the input.
-const fn target(name: &'static str, file: &'static str, seeds: Seeds, open: Open, words: &'static [u8]) -> Target {
-    Target { name, file, seeds, open, words, repair: |_| (), most_bytes: |len| (64 << 20) + 64 * len }
-}
-
-const fn layout(name: &'static str, file: &'static str, words: &'static [u8]) -> Target {
-    target(name, file, fixtures, readers::layout, words)
-}
-
-const fn checkpoint(name: &'static str, file: &'static str, words: &'static [u8]) -> Target {
-    target(name, file, of_checkpoint, readers::checkpoint, words)
+const fn target(name: &'static str, words: &'static [u8], open: Open) -> Target {
+    Target { name, words, open, repair: |_| (), most_bytes: |len| (64 << 20) + 64 * len }
 }
 
 /// An image of a few bytes may have 8,192 x 8,192 pixels: the decoder's limit, the image and its conversion.
-const IMAGE_BYTES: fn(usize) -> usize = |len| (1200 << 20) + 64 * len;
+const fn image(name: &'static str, words: &'static [u8], open: Open) -> Target {
+    Target { most_bytes: |len| (1200 << 20) + 64 * len, ..target(name, words, open) }
+}
 
-const CHUNK: &str = readers::CHUNK;
 const INDEX: &str = "re10k-mini/evaluation_index.json";
 const RE10K_TEXT: &str = "layouts/re10k_txt/test/d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a.txt";
 const SCENE_TORCH: &str = "layouts/scenes/test/d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a.torch";
 
 /// All readers. A new reader is a line here and, where it needs more than its bytes, a function in [`readers`].
 pub const TARGETS: &[Target] = &[
-    target("pickle", CHUNK, pickles, readers::pickle, words::PICKLE),
-    target("chunk", CHUNK, fixtures, readers::chunk, b""),
-    target("chunk-pickle", CHUNK, pickles, readers::chunk_pickle, words::PICKLE),
-    target("chunk-index", readers::CHUNK_INDEX, fixtures, readers::chunk, words::JSON),
-    Target {
-        repair: png_checksums,
-        most_bytes: IMAGE_BYTES,
-        ..target("image-png", "", |_, _| readers::pngs(), readers::image, words::PNG)
-    },
-    Target {
-        most_bytes: IMAGE_BYTES,
-        ..target("image-jpeg", "", |_, _| readers::jpegs(), readers::image, words::JPEG)
-    },
-    target("evaluation-index", INDEX, fixtures, readers::evaluation_index, words::JSON),
-    target("config", "config.toml", configs, readers::config, words::TOML),
-    target("scene-file", "room.clift", rooms, readers::scene_file, words::SAFETENSORS),
-    target("coded-scene", "coded.clift", coded_rooms, readers::scene_file, words::SAFETENSORS),
+    target("pickle", words::PICKLE, |_| (pickles(), readers::pickle())),
+    target("chunk", b"", |s| (vec![fixture(CHUNK)], readers::chunk(s, CHUNK))),
+    target("chunk-pickle", words::PICKLE, |s| (pickles(), readers::chunk_pickle(s))),
+    target("chunk-index", words::JSON, |s| (vec![fixture(CHUNK_INDEX)], readers::chunk(s, CHUNK_INDEX))),
+    Target { repair: png_checksums, ..image("image-png", words::PNG, |_| (readers::pngs(), readers::image())) },
+    image("image-jpeg", words::JPEG, |_| (readers::jpegs(), readers::image())),
+    target("evaluation-index", words::JSON, |s| {
+        (vec![fixture(INDEX)], file(s, "index.json", |path| done(EvaluationIndex::read(path))))
+    }),
+    target("config", words::TOML, |s| {
+        let of_run = read(&s.at("run/config.toml"));
+        (
+            vec![fixture("../configs/tiny.toml"), of_run],
+            file(s, "config.toml", |path| done(read_checked_config(path, &[], Config::validate))),
+        )
+    }),
+    target("scene-file", words::SAFETENSORS, |s| {
+        (["f32", "f16", "int8"].map(|format| room(s, format)).into(), scene_file(s))
+    }),
     Target {
         repair: scene_checksum,
-        ..target("coded-scene-checked", "checked.clift", coded_rooms, readers::scene_file, words::SAFETENSORS)
+        ..target("coded-scene", words::SAFETENSORS, |s| (vec![room(s, "coded")], scene_file(s)))
     },
-    target("token-codec", "stage2/codec.safetensors", of_run, readers::token_codec, words::SAFETENSORS),
-    target("weights", "stage1/model.safetensors", of_run, readers::weights, words::SAFETENSORS),
-    checkpoint("checkpoint-model", "model.bpk", words::SAFETENSORS),
-    checkpoint("checkpoint-optimizer", "optimizer.bpk", words::SAFETENSORS),
-    checkpoint("checkpoint-state", "state.json", words::JSON),
-    target("clusters-index", "clusters/index.json", of_run, readers::clusters, words::JSON),
-    target("clusters-data", "clusters/clusters.bin", of_run, readers::clusters, b""),
-    target("run-file", "run.json", of_run, readers::run_file, words::JSON),
-    layout("transforms", "layouts/capture/attic/transforms.json", words::TRANSFORMS),
-    layout("colmap-cameras-bin", "layouts/colmap_bin/attic/sparse/0/cameras.bin", words::BINARY),
-    layout("colmap-images-bin", "layouts/colmap_bin/attic/sparse/0/images.bin", words::BINARY),
-    layout("colmap-cameras-txt", "layouts/colmap_txt/attic/sparse/0/cameras.txt", words::TEXT),
-    layout("colmap-images-txt", "layouts/colmap_txt/attic/sparse/0/images.txt", words::TEXT),
-    layout("re10k-text", RE10K_TEXT, words::TEXT),
-    layout("scene-torch", SCENE_TORCH, words::PICKLE),
-    target("published-checkpoint", "checkpoints/re10k.ckpt", fixtures, readers::published_checkpoint, words::PICKLE),
-    target("test-scenes", INDEX, test_scenes, readers::test_scenes, words::JSON),
+    target("token-codec", words::SAFETENSORS, |s| {
+        (of_run(s, "stage2/codec.safetensors"), file(s, "codec.safetensors", |path| done(TokenCodec::read(path))))
+    }),
+    target("weights", words::SAFETENSORS, |s| (of_run(s, "stage1/model.safetensors"), readers::weights(s))),
+    target("checkpoint-model", words::SAFETENSORS, |s| readers::checkpoint(s, "model.bpk")),
+    target("checkpoint-optimizer", words::SAFETENSORS, |s| readers::checkpoint(s, "optimizer.bpk")),
+    target("checkpoint-state", words::JSON, |s| readers::checkpoint(s, "state.json")),
+    target("clusters-index", words::JSON, |s| (of_run(s, "clusters/index.json"), readers::clusters(s, "index.json"))),
+    target("clusters-data", b"", |s| (of_run(s, "clusters/clusters.bin"), readers::clusters(s, "clusters.bin"))),
+    target("run-file", words::JSON, |s| (of_run(s, "run.json"), readers::run_file(s))),
+    target("transforms", words::TRANSFORMS, |s| readers::layout(s, "layouts/capture/attic/transforms.json")),
+    target("colmap-cameras-bin", words::BINARY, |s| {
+        readers::layout(s, "layouts/colmap_bin/attic/sparse/0/cameras.bin")
+    }),
+    target("colmap-images-bin", words::BINARY, |s| readers::layout(s, "layouts/colmap_bin/attic/sparse/0/images.bin")),
+    target("colmap-cameras-txt", words::TEXT, |s| readers::layout(s, "layouts/colmap_txt/attic/sparse/0/cameras.txt")),
+    target("colmap-images-txt", words::TEXT, |s| readers::layout(s, "layouts/colmap_txt/attic/sparse/0/images.txt")),
+    target("re10k-text", words::TEXT, |s| readers::layout(s, RE10K_TEXT)),
+    target("scene-torch", words::PICKLE, |s| readers::layout(s, SCENE_TORCH)),
+    target("published-checkpoint", words::PICKLE, |s| {
+        (vec![fixture("checkpoints/re10k.ckpt")], readers::published_checkpoint(s))
+    }),
+    target("test-scenes", words::JSON, |s| {
+        (
+            vec![fixture(INDEX), b"[\"a\", \"b\"]".to_vec(), b"a\nb\n".to_vec()],
+            file(s, "test-scenes", |path| done(TestScenes::read(path))),
+        )
+    }),
 ];
 
-fn fixtures(_: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![fixture(file)]
+fn pickles() -> Vec<Vec<u8>> {
+    vec![member(&fixture(CHUNK), "data.pkl")]
 }
 
-fn pickles(_: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![member(&fixture(file), "data.pkl")]
-}
-
-fn of_run(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
+fn of_run(setup: &Setup, file: &str) -> Vec<Vec<u8>> {
     vec![read(&setup.at("run").join(file))]
 }
 
-fn of_checkpoint(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![read(&setup.checkpoint().join(file))]
+fn scene_file(setup: &Setup) -> Read {
+    file(setup, "room.clift", |path| done(Scene::read(path)))
 }
 
-fn configs(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![fixture("../configs/tiny.toml"), read(&setup.at("run").join(file))]
-}
-
-fn rooms(setup: &Setup, _: &'static str) -> Vec<Vec<u8>> {
-    ["f32", "f16", "int8"].map(|name| read(&setup.at(&format!("room-{name}.clift")))).into()
-}
-
-fn coded_rooms(setup: &Setup, _: &'static str) -> Vec<Vec<u8>> {
-    vec![read(&setup.at("room-coded.clift"))]
-}
-
-fn test_scenes(_: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![fixture(file), b"[\"a\", \"b\"]".to_vec(), b"a\nb\n".to_vec()]
+fn room(setup: &Setup, format: &str) -> Vec<u8> {
+    read(&setup.at(&format!("room-{format}.clift")))
 }
 
 /// Writes the checksum of a coded scene.

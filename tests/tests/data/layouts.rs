@@ -19,7 +19,7 @@ fn data(source: &str, layout: &str, more: &str) -> String {
 fn captures_train_and_render_and_name_missing_frames() {
     let place = Place::new();
     let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"]).ok();
-    ran.notes("train: 1 of 1 scenes used; 1 frame without an image (./images/99); no test split: 1 of 8 frames");
+    ran.notes("train: 1 scene used; 1 frame without an image (./images/99); no test split: 1 of 8 frames");
     let frame = &place.json("run/skipped-train.json")["frames"][0];
     assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
     let encode = "encode DIR/run REPO/data-fixtures/layouts/colmap_txt/attic -o DIR/attic.clift";
@@ -87,14 +87,5 @@ fn dl3dv_training_requires_a_test_scene_list() {
     let files = format!("{files} filters={{min_frames=9}},");
     place
         .train("other", &[&data("auto", "dl3dv", &files)])
-        .fails_with(1, &["0 of 1 scenes used; 1 shorter than the 9 frames of data.filters.min_frames"]);
-}
-
-#[test]
-fn a_single_scene_is_described() {
-    let place = Place::new();
-    let info = |folder: &str| place.clift(&format!("data info REPO/{folder}"));
-    let ran = info("data-fixtures/layouts/capture/attic/transforms.json").ok().prints("  image           32x18");
-    assert!(ran.stdout.starts_with("layout            captures\n"), "{}", ran.stdout);
-    info("configs").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
+        .fails_with(1, &["0 of 1 scene used; 1 shorter than the 9 frames of data.filters.min_frames"]);
 }

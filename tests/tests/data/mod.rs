@@ -1,6 +1,5 @@
-//! Data sets through the command line: other layouts than chunks, conversion, checks and timing.
+//! Data sets through the command line: other layouts than chunks, checks and indices.
 
-mod convert;
 mod data_tools;
 mod layouts;
 pub(crate) mod poses;

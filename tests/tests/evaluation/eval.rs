@@ -1,4 +1,4 @@
-//! Evaluations through the command line: formats, Pareto fronts, external methods, LPIPS, comparisons, counts.
+//! Evaluations and trainings with VGG networks: LPIPS and the perceptual loss.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -6,20 +6,9 @@ use std::path::Path;
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use crate::support::{Place, STAGE_1, WHOLE, list, number};
+use crate::support::{Place, STAGE_1, list, number};
 
 const WIDTHS: [usize; 5] = [64, 128, 256, 512, 512];
-
-/// Scene and target frame of every measured view.
-fn views(place: &Place, folder: &str) -> Vec<(String, String)> {
-    let text = place.text(&format!("{folder}/views.csv"));
-    let views = text.lines().skip(1).map(|line| {
-        let mut cells = line.split(',').map(str::to_owned);
-        (cells.next().expect("a scene"), cells.next().expect("a frame"))
-    });
-    let views: std::collections::BTreeSet<_> = views.collect();
-    views.into_iter().collect()
-}
 
 /// Writes a file in the form of `scripts/tools/convert_vgg.py`, with small random weights.
 pub fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
@@ -56,83 +45,6 @@ pub fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) 
 }
 
 #[test]
-fn every_format_and_count_has_speed_and_fronts() {
-    let place = Place::with(&WHOLE);
-    let ran = place.eval("run --format f32,f16,int8 --render 1/2 --out DIR/formats").ok();
-    ran.prints("t: no other point has a higher PSNR");
-    let points = place.points("formats");
-    let of = |variant: &str, format: &str| {
-        points.iter().filter(move |point| point["method"] == variant && point["tokens"] == format).count()
-    };
-    for format in ["f32", "f16", "int8"] {
-        // 8 and 4 of 8, 4 and 2 of 4.
-        assert_eq!((of("clift", format), of("kmeans", format)), (4, 4), "{format}");
-    }
-    assert_eq!((of("random", "f32"), of("random", "int8")), (4, 0), "random subsets have no file to be rounded in");
-    for point in &points {
-        let number = |key: &str| number(point, key);
-        assert!(number("render_p95_s") >= number("render_median_s") && number("render_median_s") > 0.0, "{point}");
-        assert!(number("frame_median_s") >= number("render_median_s"), "{point}");
-        assert!(number("gflops") > 0.0 && number("num_views") == 6.0, "{point}");
-        // Null on systems that do not report it; a process takes more than a mebibyte.
-        assert!(point["peak_bytes"].is_null() || number("peak_bytes") > 1e6, "{point}");
-    }
-    for front in ["pareto_time", "pareto_bytes"] {
-        assert!(points.iter().any(|point| point[front] == true), "{front}");
-        assert!(points.iter().any(|point| point[front] == false), "{front}");
-    }
-    // The highest PSNR is on the front of time, whatever it takes.
-    let best = points.iter().max_by(|a, b| number(a, "psnr").total_cmp(&number(b, "psnr"))).unwrap();
-    let ties = points.iter().filter(|point| point["psnr"] == best["psnr"]);
-    assert_eq!(ties.filter(|point| point["pareto_time"] == true).count(), 1);
-    let html = place.text("formats/report.html");
-    assert!(html.contains("clift, int8") && html.contains("front:<br>bytes"));
-    // 3 scenes, of 20 + 8 settings and 2 baselines.
-    assert_eq!(place.text("formats/scenes.csv").lines().count(), 1 + 3 * (points.len() + 2));
-}
-
-#[test]
-fn predictions_are_scored_and_missing_images_named() {
-    let place = Place::with(&STAGE_1);
-    place.eval("run").ok();
-    let views = views(&place, "run/eval");
-    assert_eq!(views.len(), 6);
-    let picture = image::RgbImage::from_pixel(16, 16, image::Rgb([128; 3]));
-    for (i, (scene, frame)) in views.iter().enumerate().skip(1) {
-        // Both layouts.
-        let folder = place.at("grey").join(scene).join(if i % 2 == 0 { "color" } else { "" });
-        std::fs::create_dir_all(&folder).unwrap();
-        picture.save(folder.join(format!("{frame:0>6}.png"))).unwrap();
-    }
-    let ran = place.eval("run --predictions DIR/grey --name Grey&co --data-size 1.5kB").ok();
-    let missing = format!("{}/{:0>6}.png", views[0].0, views[0].1);
-    ran.prints("Grey&co: 1 of 6 images are missing").prints(&missing);
-    let summary = place.json("run/eval/summary.json");
-    assert_eq!(summary["missing"][0]["images"], serde_json::json!([missing]));
-    let point = list(&summary["points"]).iter().find(|point| point["method"] == "Grey&co").unwrap();
-    assert_eq!((&point["num_views"], &point["scene_bytes"]), (&5.into(), &1500.into()));
-    assert!((5.0..40.0).contains(&number(point, "psnr")), "{point}");
-    assert!(place.text("run/eval/report.html").contains("Grey&amp;co"));
-    assert_eq!(place.text("run/eval/views.csv").matches(",Grey&co,0,0,").count(), 5);
-
-    // Another size, no image at all, a reserved name, more names than folders.
-    let (scene, frame) = &views[1];
-    let small = place.at("small").join(scene);
-    std::fs::create_dir_all(&small).unwrap();
-    image::RgbImage::new(8, 16).save(small.join(format!("{frame:0>6}.png"))).unwrap();
-    std::fs::create_dir_all(place.at("empty")).unwrap();
-    for (flags, code, expected) in [
-        ("DIR/small", 1, "8 x 16 pixels, expected 16 x 16 like the target"),
-        ("DIR/empty", 2, "empty has none of the 6 target images, such as synthetic-0-test-"),
-        ("DIR/grey --name clift", 2, "reserved for a method of clift"),
-        ("DIR/grey --name a --name b", 2, "1 --predictions but 2 --name"),
-        ("no/such/folder", 2, "no/such/folder"),
-    ] {
-        place.eval(&format!("run --predictions {flags}")).fails_with(code, &[expected]);
-    }
-}
-
-#[test]
 fn lpips_needs_its_weights() {
     let place = Place::with(&STAGE_1);
     let missing = "lpips_vgg is not measured: eval.lpips_weights is not set; make the file with `python3";
@@ -154,11 +66,6 @@ fn lpips_needs_its_weights() {
     }
     assert!(number(&summary["baselines"]["nearest_view"], "lpips_vgg") > 0.0);
 
-    // The wrong file, and none where one is named.
-    write_vgg(&place.at("other.safetensors"), "clift-vgg19-1", [2, 2, 4, 4, 2], false);
-    place
-        .eval("run --set eval.lpips_weights=\"DIR/other.safetensors\"")
-        .fails_with(2, &["format clift-vgg19-1, expected", "convert_vgg.py lpips"]);
     let set = ["eval.lpips_weights=\"no/such/file\""];
     place.train("new", &set).fails_with(2, &["`eval.lpips_weights` = no/such/file: file not found"]);
 }
@@ -170,6 +77,8 @@ fn the_perceptual_loss_trains_both_stages() {
     let short = ["stage1.steps=2", "stage2.steps=3", "eval.num_scenes=1"];
     let weight = "loss.perceptual_weight=0.5";
     place.train("run", &[weight]).fails_with(2, &["`loss.vgg_weights` = missing", "convert_vgg.py vgg19"]);
+    let missing = [weight, "loss.vgg_weights=\"no/such/file\""];
+    place.train("run", &missing).fails_with(2, &["`loss.vgg_weights` = no/such/file: file not found"]);
     assert!(!place.at("run").exists(), "nothing is begun");
     let file = place.at("vgg19.safetensors");
     write_vgg(&file, "clift-vgg19-1", [2, 2, 4, 4, 2], false);
@@ -180,57 +89,8 @@ fn the_perceptual_loss_trains_both_stages() {
         let mse = 10_f64.powf(number(&line, "psnr") / -10.0);
         assert!(number(&line, "loss") > mse, "PSNR is of the squared error alone: {line}");
     }
-    // The same updates, computed again; the same losses to the last digit of f32.
-    place.train("again", &[&set[..], &["activation_checkpointing=true"]].concat()).ok();
-    place.assert_same_result("again", "run");
     // The term changes the weights.
     place.train("plain", &short).ok();
     assert!(place.weights("plain", "stage1") != place.weights("run", "stage1"));
     assert!(place.weights("plain", "stage2").part("condenser.") != place.weights("run", "stage2").part("condenser."));
-}
-
-#[test]
-fn two_evaluations_are_compared_pair_by_pair() {
-    let place = Place::new();
-    place.copy(&WHOLE, "a");
-    place.train("b", &["seed=1", "stage1.steps=8"]).ok();
-    let ran = place.clift("compare DIR/a DIR/b --json DIR/difference.json").ok();
-    ran.prints("clift 8 f32").prints("random 4 f32");
-    let comparison = place.json("difference.json");
-    let pairs = list(&comparison["pairs"]);
-    // Six settings and the two baselines, whose images do not depend on the weights.
-    assert_eq!(pairs.len(), 8);
-    for pair in pairs {
-        assert_eq!((&pair["num_scenes"], &pair["num_only_a"]), (&3.into(), &0.into()), "{pair}");
-        let of_pair = |key: &str| number(&pair["psnr"], key);
-        assert!((of_pair("b") - of_pair("a") - of_pair("mean")).abs() < 1e-9, "{pair}");
-        if pair["a"]["num_storage_tokens"] == 0 {
-            assert_eq!(of_pair("mean"), 0.0);
-            continue;
-        }
-        for run in ["a", "b"] {
-            let points = place.points(&format!("{run}/eval"));
-            let keys = ["method", "num_storage_tokens", "num_render_tokens"];
-            let point = points.iter().find(|point| keys.iter().all(|key| point[key] == pair["a"][key]));
-            let psnr = number(point.unwrap(), "psnr");
-            assert!((psnr - of_pair(run)).abs() < 1e-9, "the mean over scenes of the summary");
-        }
-    }
-    place.clift("compare DIR/a no/such/run").fails_with(2, &["no/such/run", "no such file or folder"]);
-    place.clift("compare DIR/a DIR/a/stage1").fails_with(2, &["no views.csv here or in `eval`; `clift eval` writes"]);
-}
-
-#[test]
-fn the_papers_counts_come_out_of_the_command() {
-    let place = Place::new();
-    let ran = place.clift("flops --convention paper").ok();
-    ran.prints("render  4096    70.59").prints("render  512     45.23");
-    place.clift("flops REPO/configs/tiny.toml --render 16,1.0 --json DIR/flops.json").ok();
-    let counts = place.json("flops.json");
-    assert_eq!((&counts["convention"], &counts["num_tokens"]), (&"macs".into(), &256.into()));
-    let rendered = list(&counts["rows"]).iter().filter(|row| row["work"] == "render");
-    assert_eq!(rendered.map(|row| &row["num_tokens"]).collect::<Vec<_>>(), [16, 256]);
-    place.clift("flops REPO/configs/re10k.toml").ok().prints("4 context views, 4096 tokens");
-    place.clift("flops --convention flop").fails_with(2, &["flop"]);
-    place.clift("flops --render 5000").fails_with(2, &["a scene has 4096 tokens"]);
 }

@@ -1,6 +1,6 @@
 //! LVSM's encoder-decoder: one stage of training, evaluation beside `CLiFT`, scene files.
 
-use crate::support::{Place, Shared, WHOLE, list, number, point};
+use crate::support::{Place, Shared, WHOLE, number, point};
 
 const LVSM: [&str; 4] = [
     "model.architecture=\"lvsm-ed\"",
@@ -15,9 +15,7 @@ static FIVE: Shared = Shared::new("run", &LVSM);
 fn its_one_stage_trains_and_resumes_exactly() {
     let place = Place::new();
     let longer = ["stage1.steps=30", "checkpoint={every=17, keep=2}", "eval.every=17"];
-    for (name, set) in
-        [("paper", &[][..]), ("stock", &["model.variant=\"released-re10k\"", "activation_checkpointing=true", MUON])]
-    {
+    for (name, set) in [("plain", &[][..]), ("muon", &[MUON])] {
         let set = [&LVSM[..], &longer, set].concat();
         let [whole, parts] = ["whole", "parts"].map(|part| format!("{part}-{name}"));
         place.train(&whole, &set).ok().prints("lvsm_ed");
@@ -42,7 +40,7 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
     let three = [&LVSM[..1], &["model.num_latents=3"], &LVSM[2..]].concat();
     place.train("three", &three).ok();
     let words = "run --preset main --stored-tokens 1/2 --with DIR/five --with DIR/three --out DIR/out";
-    place.eval(words).ok().prints("lvsm_ed").prints("values");
+    place.eval(words).ok().prints("lvsm_ed");
     let points = place.points("out");
     assert_eq!(points.len(), 5, "f16 and two coded of CLiFT, two sizes of LVSM: {points:?}");
     place.eval("five --format f16").ok();
@@ -52,16 +50,11 @@ fn several_sizes_stand_beside_clift_in_one_evaluation() {
             (found["scene_values"].as_u64(), found["num_render_tokens"].as_u64()),
             (Some(16 * count as u64), Some(count as u64))
         );
-        place.clift(&format!("flops DIR/{name}/config.toml --convention macs --json DIR/flops.json --force")).ok();
-        let flops = place.json("flops.json");
-        assert_eq!(number(found, "gflops"), number(&list(&flops["rows"])[0], "giga"));
-        assert_eq!(list(&flops["rows"]).len(), 2, "render and encode");
         place.clift(&format!("encode DIR/{name} --scene synthetic-0-test-00000 -o DIR/{name}.clift")).ok();
         assert_eq!(found["scene_bytes"].as_u64(), Some(place.bytes(&format!("{name}.clift")).len() as u64));
     }
     let own = place.points("five/eval");
     assert_eq!(number(point(&own, "lvsm_ed", 5), "psnr"), number(point(&points, "lvsm_ed", 5), "psnr"));
-    assert!(place.text("out/report.html").contains("Quality against stored values"));
 
     place.eval("run --with DIR/five --with DIR/five").fails_with(2, &["as many latents"]);
     place.eval("five --render 2").fails_with(2, &["`eval.render`", "are rendered from all tokens"]);
@@ -77,18 +70,14 @@ fn latents_are_stored_and_rendered_whole() {
     assert!(!encoded.stdout.contains("clusters"), "{}", encoded.stdout);
     place.clift("render DIR/room.clift --path interpolate --frames 3 -o DIR/frames").ok().prints("5 of 5 tokens");
     place.clift("export DIR/run --format f16 -o DIR/half").ok();
+    place.clift("export DIR/run --format f16 -o DIR/half").fails_with(2, &["the path exists"]);
     place.clift("plan DIR/run/config.toml").ok().prints("stage1");
 
     place
         .clift("render DIR/room.clift --path orbit --render 2 -o DIR/few")
         .fails_with(2, &["none can be selected by the camera"]);
     place.clift("view DIR/room.clift --no-open").fails_with(2, &["learned tokens of lvsm-ed lie nowhere"]);
-    place.clift("export DIR/run --format pytorch -o DIR/a.pt").fails_with(2, &["write --format f16"]);
-    for (flags, part) in [
-        ("--stored-tokens 2", "not clustered: write 5"),
-        ("--save-clusters DIR/clusters.json", "not clustered"),
-        ("--format coded", "have no codec"),
-    ] {
+    for (flags, part) in [("--stored-tokens 2", "not clustered: write 5"), ("--format coded", "have no codec")] {
         place.clift(&format!("{encode} --force {flags}")).fails_with(2, &[part]);
     }
     // The network of a scene is part of it.

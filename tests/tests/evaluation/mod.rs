@@ -1,11 +1,9 @@
-//! Evaluations and what they write, scene files, videos, published checkpoints.
+//! Evaluations and what they write, scene files, published checkpoints.
 
-mod checkpoints;
+pub mod checkpoints;
 mod coded;
 pub mod eval;
 mod lvsm;
-mod report;
 mod scene_files;
 mod splits;
 mod tiles;
-mod videos;

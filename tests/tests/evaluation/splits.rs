@@ -1,20 +1,11 @@
 //! What the figures of an evaluation were measured on: splits, held-out frames, targets that are also contexts.
 
-use std::collections::BTreeSet;
-
-use clift_data::{ImageEncoding, SyntheticConfig, SyntheticSource, read_scene, write_chunks};
 use serde_json::json;
 
 use crate::support::{Place, STAGE_1, number, repository};
 
 /// The test scene of `data-fixtures/re10k-mini`, of eight frames.
 const KEY: &str = "00000000000000b1";
-
-/// Keys that train on the two training clips of `re10k-mini`, a folder without a test split.
-fn no_test_split() -> [String; 3] {
-    let root = repository("data-fixtures/re10k-mini/train");
-    ["data.source=\"auto\"".into(), format!("data.root={:?}", root.display().to_string()), "data.hold_out=4".into()]
-}
 
 /// Target frames of an evaluation.
 fn target_frames(place: &Place, eval: &str) -> Vec<usize> {
@@ -25,9 +16,8 @@ fn target_frames(place: &Place, eval: &str) -> Vec<usize> {
 #[test]
 fn runs_without_test_split_are_measured_on_held_out_frames() {
     let place = Place::new();
-    let set = no_test_split();
-    let set: Vec<&str> = set.iter().map(String::as_str).collect();
-    let ran = place.train("run", &set).ok();
+    let root = format!("data.root={:?}", repository("data-fixtures/re10k-mini/train"));
+    let ran = place.train("run", &["data.source=\"auto\"", &root, "data.hold_out=4"]).ok();
     ran.notes("1 of 4 frames (0, 4, ..) is held out of training").prints("(held-out frames of training scenes)");
     assert_eq!(place.json("run/eval/summary.json")["split"], "held_out_frames");
     assert!(target_frames(&place, "run/eval").iter().all(|frame| frame % 4 == 0));
@@ -49,22 +39,6 @@ fn runs_without_test_split_are_measured_on_held_out_frames() {
     place.eval("run --set data.hold_out=3 --out DIR/same").ok();
     assert_eq!(target_frames(&place, "same"), target_frames(&place, "run/eval"));
 
-    // Weights beside the data, without the knowledge of what was held out.
-    let foreign = "eval --checkpoint DIR/run/stage1 --data REPO/data-fixtures/re10k-mini/train --out DIR/";
-    place.clift(&format!("{foreign}all")).ok();
-    place
-        .clift(&format!("{foreign}held-out --set data.hold_out=4"))
-        .ok()
-        .prints(" context views, rendered from all tokens");
-    let distinct = |eval: &str| target_frames(&place, eval).into_iter().collect::<BTreeSet<_>>();
-    assert_eq!(distinct("held-out"), distinct("run/eval"), "the methods differ, as stage 1 has fewer");
-    assert!(target_frames(&place, "all").iter().any(|frame| frame % 4 != 0));
-    let contexts = |eval: &str| place.json(&format!("{eval}/summary.json"))["context_frames"].clone();
-    assert_eq!(contexts("held-out"), contexts("run/eval"));
-    assert_ne!(contexts("held-out"), contexts("all"));
-
-    place.train("overfit --overfit 1", &set).ok().prints("(training scenes)").prints(warning);
-    assert_eq!(place.json("overfit/eval/summary.json")["split"], "train");
     place.train("other", &["data.hold_out=1"]).fails_with(2, &["`data.hold_out` = 1: no frame would be left"]);
 }
 
@@ -84,17 +58,4 @@ fn targets_that_are_contexts_are_counted_and_dropped() {
     assert!(number(&given, "psnr") > 50.0 && number(&dropped, "psnr") < 40.0, "{given} {dropped}");
     assert_eq!(target_frames(&place, "dropped"), [3; 6], "four points and two baselines");
     assert!(place.text("given/report.html").contains("1 target is also a context"));
-}
-
-#[test]
-fn scene_key_of_5000_letters_has_a_sheet() {
-    let place = Place::with(&STAGE_1);
-    let rooms = SyntheticConfig { num_scenes: 1, num_frames: 8, width: 16, height: 16, ..Default::default() };
-    let rooms = SyntheticSource::new(rooms).unwrap();
-    let (mut record, _) = read_scene(&rooms, 0, ImageEncoding::Png, None).unwrap();
-    record.key = "k".repeat(5000);
-    write_chunks(&place.at("long"), [Ok(record)], 1).unwrap();
-    place.eval("run --data DIR/long --out DIR/out").ok();
-    let sheets = place.names("out/sheets");
-    assert!(sheets.len() == 1 && sheets[0].len() < 200, "{sheets:?}");
 }

@@ -47,7 +47,7 @@ fn tile_runs_encode_scenes_and_refuse_their_kind() {
     let patchwise = place.eval("run --preset patchwise --stored-tokens 1/2");
     patchwise.fails_with(2, &["clusters.grouping = \"tile\"", "--with"]);
     let encode = "encode DIR/tiles --scene synthetic-0-test-00000 --stored-tokens 4 -o DIR/room.clift";
-    place.clift(encode).ok().prints("variance within clusters");
+    place.clift(encode).ok().prints("4 of 8 tokens");
     place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/orbit").ok();
     place.clift("codec DIR/tiles").fails_with(2, &["clusters.grouping", "the token codec is one of K-means tokens"]);
 

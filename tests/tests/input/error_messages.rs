@@ -3,7 +3,7 @@
 
 use std::process::Command;
 
-use crate::support::{BINARY, Place, Ran, clift, finish, repository, start};
+use crate::support::{BINARY, Place, Ran, finish, repository, start};
 
 const RIGHT: &str = include_str!("../../snapshots/right.toml");
 
@@ -85,7 +85,8 @@ fn every_wrong_input_gives_its_message() {
     }
     let config = place.at("right.toml").display().to_string();
     for (name, set) in OVERRIDES {
-        differing.extend(differs(name, &clift(["train", &config, "--set", set]), &dir));
+        let ran = finish(start(Command::new(BINARY).args(["train", &config, "--set", set])));
+        differing.extend(differs(name, &ran, &dir));
         assert!(!place.at("run").exists(), "{name}: a refused override leaves nothing behind");
     }
     for (name, words) in COMMANDS {
@@ -106,26 +107,4 @@ fn differs(name: &str, ran: &Ran, dir: &str) -> Option<String> {
     }
     let expected = std::fs::read_to_string(&path).unwrap_or_default();
     (said != expected).then(|| format!("{name}\nexpected:\n{expected}\ngot:\n{said}"))
-}
-
-#[test]
-fn an_instruction_set_that_is_none_is_refused() {
-    let place = Place::new();
-    let mut command = Command::new(BINARY);
-    let command = command.args(place.train_args("run", &[])).env("CLIFT_INSTRUCTION_SET", "avx9");
-    let expected = "`CLIFT_INSTRUCTION_SET` = avx9: unknown instruction set; use one of ";
-    finish(start(command)).fails_with(2, &[expected]);
-    assert!(!place.at("run").exists());
-}
-
-#[test]
-fn plans_name_wrong_values_and_need_no_data() {
-    let place = Place::new();
-    let fixed = "plan REPO/configs/re10k.toml --device flex --set loss.perceptual_weight=0.0";
-    place
-        .clift(&format!("{fixed} --set model.num_heads=7"))
-        .fails_with(2, &["`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8"]);
-    place.clift(&format!("{fixed} --json DIR/plan.json")).ok();
-    let part = &place.json("plan.json")["parts"][0];
-    assert_eq!(part["trained_parameters"], 81_239_232);
 }

@@ -1,4 +1,4 @@
-//! A rank that ends early ends all, with one message.
+//! A rank that ends early ends all, with one message; a finished run is reported once.
 
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -62,4 +62,14 @@ fn a_launcher_that_mpi_does_not_know_is_named() {
     let mut command = Command::new(BINARY);
     let ran = finish(start(command.envs(step).args(place.train_args("run", &[]))));
     ran.fails_with(2, &["a launcher started 2 processes, and MPI connects 1 of them", "srun --mpi=pmix"]);
+}
+
+#[test]
+fn a_finished_run_is_reported_by_rank_0_alone() {
+    let _one = one_at_a_time();
+    let place = Place::new();
+    place.train("run", &[]).ok();
+    let ran = finish(start_train(&place, 2, "run", &[])).ok();
+    assert_eq!(ran.stderr.matches("the run is trained and evaluated").count(), 1, "{}", ran.stderr);
+    assert_eq!(ran.stdout.matches("report: ").count(), 1, "{}", ran.stdout);
 }

@@ -1,9 +1,10 @@
 //! A run whose ranks are killed at random moments, and that resumes with other numbers of ranks, ends in the same bytes.
 
-use std::time::Instant;
+use std::process::Child;
+use std::time::{Duration, Instant};
 
 use crate::engine::{end_within_a_minute, one_at_a_time, ranks_of, signal, start_train};
-use crate::support::{Place, draw, finish, wait_at_most};
+use crate::support::{Place, finish};
 
 /// Three parts, for up to three ranks; a checkpoint after every second step.
 const SAVING: [&str; 8] = [
@@ -18,6 +19,20 @@ const SAVING: [&str; 8] = [
 ];
 
 const NUM_KILLS: usize = 10;
+
+/// A value in [0, 1), the same in every test run (the upper bits of an LCG).
+fn draw(state: &mut u64) -> f64 {
+    *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+    (*state >> 33) as f64 / (1_u64 << 31) as f64
+}
+
+/// Waits for a time, or until the child has ended.
+fn wait_at_most(time: Duration, child: &mut Child) {
+    let until = Instant::now() + time;
+    while Instant::now() < until && child.try_wait().expect("a child").is_none() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
 
 #[test]
 fn runs_with_killed_ranks_end_the_same_on_any_number_of_ranks() {

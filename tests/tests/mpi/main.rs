@@ -5,7 +5,6 @@
 mod ends;
 mod engine;
 mod kills;
-mod results;
 #[allow(dead_code)]
 #[path = "../support.rs"]
 mod support;

@@ -24,7 +24,10 @@ fn killed_runs_end_the_same_with_any_loader_threads() {
         kill_at("set/4");
         place.train(&format!("{name} --only clusters"), &set).ok().notes("clusters: resumed after 4 of 6 context sets");
         kill_at("saved/stage2/17");
-        place.train(name, &set).ok().notes("stage2: resumed after 17 of 30 steps");
+        let ran =
+            place.train(&format!("{name} --only stage2"), &set).ok().notes("stage2: resumed after 17 of 30 steps");
+        assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
+        place.eval(name).ok();
         assert_eq!(place.checkpoints(name, "stage1"), [17, 30]);
         // The best validation decides which checkpoints are kept.
         assert!(place.progress(name, "stage2")["best"]["step"].is_u64());
@@ -81,15 +84,12 @@ fn runs_with_camera_relative_attention_and_muon_resume_exactly() {
     let place = Place::new();
     let muon = "optimizer={algorithm=\"muon\", learning_rate=1e-3, warm_up_steps=2}";
     let [stage1, stage2] = ["stage1", "stage2"].map(|stage| format!("{stage}.{muon}"));
-    let keys = |encoding: &'static str| [&THIRTY[..], &[encoding, &stage1, &stage2]].concat();
-    let gta = keys("model.camera_encoding=\"gta\"");
-    place.train("gta", &gta).ok();
-    place.kill_at("step/stage1/25", "parts", &gta);
-    place.kill_at("saved/stage2/17", "parts", &gta);
-    place.train("parts", &gta).ok();
-    place.assert_same_run("parts", "gta");
-    place.train("prope", &keys("model.camera_encoding=\"prope\"")).ok();
-    assert_ne!(last_loss(&place, "gta"), last_loss(&place, "prope"));
+    let set = [&THIRTY[..], &["model.camera_encoding=\"gta\"", &stage1, &stage2]].concat();
+    place.train("whole", &set).ok();
+    place.kill_at("step/stage1/25", "parts", &set);
+    place.kill_at("saved/stage2/17", "parts", &set);
+    place.train("parts", &set).ok();
+    place.assert_same_run("parts", "whole");
 }
 
 #[test]
@@ -134,49 +134,15 @@ fn spikes_are_skipped_identically_after_kills() {
     place.assert_same_run("parts", "whole");
     let lines = place.json_lines("whole/bad_steps.jsonl");
     assert_eq!(place.progress("whole", "stage1")["num_bad_steps"], lines.len());
-    let metrics = place.metrics("whole");
     for line in &lines {
-        let step = line["step"].as_u64().expect("a number");
-        assert!(step > 20, "twenty steps make a median: {line}");
+        assert!(number(line, "step") > 20.0, "twenty steps make a median: {line}");
         let ratio = match line["reason"].as_str() {
             Some("loss_spike") => number(line, "loss") / number(line, "median_loss"),
             _ => number(line, "grad_norm") / number(line, "median_grad_norm"),
         };
-        assert!(ratio > 1.1, "{line}");
-        assert_eq!(metrics[step as usize - 1]["loss"], line["loss"]);
-        let scenes = list(&line["scenes"]);
-        assert_eq!(scenes.len(), 2, "a batch of two");
-        let is_clip = |scene: &Value| {
-            let is_key = scene["key"].as_str().is_some_and(|key| key.starts_with("synthetic-0-train-"));
-            is_key && list(&scene["context"]).len() == 2
-        };
-        assert!(scenes.iter().all(is_clip), "{line}");
+        assert!(ratio > 1.1 && list(&line["scenes"]).len() == 2, "{line}");
     }
-    // A step is compared with the median of its own window.
-    let first = lines[0]["step"].as_u64().expect("a number") as usize;
-    let mut losses: Vec<f64> = metrics[..first - 1].iter().map(|line| number(line, "loss")).collect();
-    losses.sort_by(f64::total_cmp);
-    assert_eq!(lines[0]["median_loss"].as_f64(), Some(losses[losses.len() / 2]));
-
     place.train("calm --only stage1", &[&SPIKES[..1], &SPIKES[2..]].concat()).ok();
     assert!(!place.at("calm/bad_steps.jsonl").exists(), "no step is a hundred times the median");
     assert_ne!(place.weights("calm", "stage1"), place.weights("whole", "stage1"));
-}
-
-#[test]
-fn consecutive_spikes_stop_the_run() {
-    let place = Place::new();
-    // One batch in three is a spike, so three follow each other soon.
-    let spikes = "stage1.optimizer={learning_rate=1e-3, warm_up_steps=2, spike_factor=1.01, max_bad_steps=3}";
-    let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=5, keep=1}", spikes];
-    let message = place.train("run --only stage1", &set).fails_with(
-        1,
-        &["error: skipped 3 consecutive steps, the last at step ", " is a spike (scenes synthetic-0-train-"],
-    );
-    let step = *place.checkpoints("run", "stage1").last().expect("a checkpoint");
-    place.assert_names_last_checkpoint("run", step, &message);
-    // A second try meets the same spikes and ends with the same message.
-    let again = place.train("run --only stage1", &set).fails(1);
-    let told = |message: &str| message.lines().find(|line| line.starts_with("error: ")).map(str::to_owned);
-    assert_eq!(told(&again), told(&message));
 }

@@ -2,26 +2,21 @@
 
 use std::process::Command;
 
-use crate::support::{BINARY, Place, STAGE_1, Shared, SmallDisk, finish, start};
+use crate::support::{BINARY, Place, STAGE_1, finish, start};
 
 /// Stage 1 of 24 steps, with a checkpoint at step 12.
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
-static UNDISTURBED: Shared = Shared::new("run", &HALF);
-
-fn num_bytes(place: &Place, name: &str) -> u64 {
-    place.bytes(name).len() as u64
-}
 
 /// A limit on file sizes stops a save as a full disk does, without the right to mount one.
 #[test]
 fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
-    place.copy(&UNDISTURBED, "whole");
+    place.train("whole", &HALF).ok();
     place.kill_at("saved/stage1/12", "run", &HALF);
-    let model = num_bytes(&place, "run/stage1/checkpoints/step-000000012/model.bpk");
+    let model = place.bytes("run/stage1/checkpoints/step-000000012/model.bpk").len();
     // Blocks have 512 bytes or 1,024, by the shell; the config fits and the weights do not.
     let blocks = model / 1024 - 1;
-    assert!(num_bytes(&place, "run/config.toml") < blocks * 512, "{model}");
+    assert!(place.bytes("run/config.toml").len() < blocks * 512, "{model}");
     let mut command = Command::new("sh");
     command.args(["-c", "trap '' XFSZ; ulimit -f $0; exec \"$@\"", &blocks.to_string(), BINARY]);
     let message = finish(start(command.args(place.train_args("run", &HALF)))).fails_with(
@@ -35,36 +30,6 @@ fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     place.assert_names_last_checkpoint("run", 12, &message);
     place.train("run", &HALF).ok();
     place.assert_same_run("run", "whole");
-}
-
-#[test]
-fn full_disks_keep_the_checkpoint_and_runs_resume() {
-    let place = Place::new();
-    let folder = place.at("disk");
-    let Some(disk) = SmallDisk::mount(&folder, 4096) else { return };
-    place.copy(&UNDISTURBED, "whole");
-    let run = "disk/run";
-    place.kill_at("saved/stage1/12", run, &HALF);
-    // Fills the disk up to less than a checkpoint takes.
-    let model = num_bytes(&place, "disk/run/stage1/checkpoints/step-000000012/model.bpk");
-    let free = || {
-        let output = finish(start(Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder)));
-        output.stdout.split_whitespace().map(|number| number.parse::<u64>().expect("a number")).product::<u64>()
-    };
-    std::fs::write(folder.join("ballast"), vec![1; (free() - model / 2) as usize]).expect("fits");
-    let parts = ["No space left on device", "stage1 stopped after step 24; "];
-    let message = place.train(run, &HALF).fails_with(1, &parts);
-    place.assert_names_last_checkpoint(run, 12, &message);
-
-    // No line of metrics fits: the run stops before the next save, without a gap in its metrics.
-    let _ = std::fs::write(folder.join("more-ballast"), vec![1; free() as usize]);
-    place.train(run, &HALF).fails_with(1, &["No space left on device"]);
-    for name in ["ballast", "more-ballast"] {
-        std::fs::remove_file(folder.join(name)).expect("removes");
-    }
-    place.train(run, &HALF).ok();
-    place.assert_same_run(run, "whole");
-    drop(disk);
 }
 
 #[test]

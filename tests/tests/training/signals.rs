@@ -1,10 +1,9 @@
 //! Signals and second processes.
 
 use std::os::unix::process::ExitStatusExt;
-use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::support::{BINARY, Place, finish, signal, start, wait_until};
+use crate::support::{Place, finish, signal, wait_until};
 
 /// A run that lasts until the signal arrives.
 const LONG: [&str; 5] =
@@ -67,20 +66,6 @@ fn second_signals_end_runs_after_a_second() {
     let ended = "ended without saving; the same command resumes from the last checkpoint\n";
     assert!(ran.stderr.ends_with(ended), "{}", ran.stderr);
     assert!(!ran.stderr.contains("saved ") && !place.at("run/stage1/checkpoints").exists(), "{}", ran.stderr);
-}
-
-#[test]
-fn a_run_started_by_nohup_outlives_its_terminal() {
-    let place = Place::new();
-    let mut command = Command::new("sh");
-    command.args(["-c", "trap '' HUP; exec \"$@\"", "sh", BINARY]).args(place.train_args("run", &LONG));
-    let mut child = start(&mut command);
-    place.wait_for_steps("run", &mut child, 5);
-    signal(&child, "-HUP");
-    let steps = place.metrics("run").len();
-    place.wait_for_steps("run", &mut child, steps + 20);
-    signal(&child, "-TERM");
-    finish(child).fails(143);
 }
 
 #[test]

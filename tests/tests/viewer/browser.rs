@@ -3,18 +3,11 @@
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::support::{BINARY, Place, WHOLE, finish, repository, skip, start};
-use crate::viewer::chromium::{Chromium, decode_base64};
-use crate::viewer::tab::Viewer;
+use base64::prelude::{BASE64_STANDARD, Engine};
 
-/// Starts a browser, without which the test is skipped.
-fn browser(place: &Place) -> Option<Chromium> {
-    let browser = Chromium::start(&place.at("browser"));
-    if browser.is_none() {
-        skip("chromium", "no Chromium on the PATH");
-    }
-    browser
-}
+use crate::support::{BINARY, Place, WHOLE, finish, skip, start};
+use crate::viewer::chromium::Chromium;
+use crate::viewer::tab::Viewer;
 
 /// Waits until the page shows a picture at rest of a later camera than `seq`; returns its number.
 fn rest_after(browser: &mut Chromium, seq: u64) -> u64 {
@@ -27,16 +20,16 @@ fn rest_after(browser: &mut Chromium, seq: u64) -> u64 {
 fn pixels(browser: &mut Chromium) -> image::RgbImage {
     let url = browser.evaluate("document.getElementById('picture').toDataURL('image/png')");
     let (_, data) = url.as_str().expect("text").split_once(',').expect("a data URL");
-    image::load_from_memory(&decode_base64(data)).expect("PNG").to_rgb8()
+    image::load_from_memory(&BASE64_STANDARD.decode(data).expect("base64")).expect("PNG").to_rgb8()
 }
 
 #[test]
 fn browser_turns_the_camera_and_renders_its_exported_path() {
     let place = Place::with(&WHOLE);
-    let Some(mut browser) = browser(&place) else { return };
-    let folder = browser.save_downloads(&place.at(""));
-    let viewer = Viewer::start(&["run"], &folder);
-    browser.set_size([1200, 800]);
+    let Some(mut browser) = Chromium::start(&place.at("")) else {
+        return skip("chromium", "no Chromium on the PATH");
+    };
+    let viewer = Viewer::start(&["run"], &place.at(""));
     browser.open(&viewer.url);
     let seq = rest_after(&mut browser, 0);
     assert_eq!(browser.evaluate("location.search"), "", "the token is not left in the address");
@@ -119,38 +112,4 @@ fn render_export(browser: &mut Chromium, place: &Place, num_frames: usize) -> im
     let frames = place.names("frames").iter().filter(|name| name.starts_with("frame-")).count();
     assert_eq!(frames, num_frames);
     image::open(place.at(&format!("frames/frame-{:05}.png", num_frames - 1))).expect("PNG").to_rgb8()
-}
-
-/// Writes the picture of the documents, of the scene `CLIFT_VIEW_NUMBER` in the list:
-/// `CLIFT_VIEW_SCENE=runs/tiny CLIFT_VIEW_OUT=shots cargo test --release --workspace viewer_screenshot -- --ignored`.
-#[test]
-#[ignore = "writes a picture"]
-fn viewer_screenshot() {
-    let [scene, out] = ["CLIFT_VIEW_SCENE", "CLIFT_VIEW_OUT"].map(|name| std::env::var(name).expect(name));
-    let place = Place::new();
-    let out = std::path::absolute(out).expect("a path");
-    std::fs::create_dir_all(&out).expect("writable");
-    let scene = std::path::absolute(scene).expect("a path");
-    let mut browser = browser(&place).expect("Chromium");
-    let viewer = Viewer::start(&[&scene.display().to_string()], &repository(""));
-    // The picture of the documents: true image beside rendering, from most of all tokens.
-    browser.set_size([1240, 904]);
-    browser.open(&viewer.url);
-    rest_after(&mut browser, 0);
-    let number = std::env::var("CLIFT_VIEW_NUMBER").unwrap_or_else(|_| "0".into());
-    for (id, value) in [("scene", number.as_str()), ("stored", "stored.max"), ("render", "render.max - 1")] {
-        browser.evaluate(&format!(
-            "{id}.value = {value}; for (const type of ['input', 'change']) {id}.dispatchEvent(new Event(type))"
-        ));
-        std::thread::sleep(Duration::from_secs(3));
-    }
-    browser.evaluate("document.querySelector('#overlay [data-value=selected]').click()");
-    browser.evaluate("document.getElementById('compare').click()");
-    for i in 0..40 {
-        browser.evaluate("document.getElementById('size').dispatchEvent(new Event('change'))");
-        std::thread::sleep(Duration::from_millis(10 + i % 2));
-    }
-    std::thread::sleep(Duration::from_secs(2));
-    browser.screenshot(&out.join("viewer.png"));
-    assert_eq!(browser.problems, [""; 0], "errors of the page");
 }

@@ -2,7 +2,7 @@
 
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, ChildStderr, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -25,7 +25,7 @@ pub struct Chromium {
 }
 
 impl Chromium {
-    /// Starts a browser with its files in `folder`; `None` where there is none.
+    /// Starts a browser with its profile and downloads in `folder`; `None` where there is none.
     pub fn start(folder: &Path) -> Option<Self> {
         let profile = folder.join("profile");
         let profile = format!("--user-data-dir={}", profile.display());
@@ -62,11 +62,15 @@ impl Chromium {
         for domain in ["Page", "Runtime", "Log"] {
             browser.call(&format!("{domain}.enable"), json!({}));
         }
+        let downloads = json!({"behavior": "allow", "downloadPath": folder.display().to_string()});
+        browser.call("Browser.setDownloadBehavior", downloads);
+        let size = json!({"width": 1200, "height": 800, "deviceScaleFactor": 1, "mobile": false});
+        browser.call("Emulation.setDeviceMetricsOverride", size);
         Some(browser)
     }
 
     /// Calls a method and returns its result.
-    pub fn call(&mut self, method: &str, params: Value) -> Value {
+    fn call(&mut self, method: &str, params: Value) -> Value {
         self.try_call(method, params).unwrap_or_else(|error| panic!("{method}: {error}"))
     }
 
@@ -138,29 +142,6 @@ impl Chromium {
         }
         mouse("mouseReleased", to, 0);
     }
-
-    /// Writes a screenshot of the page.
-    pub fn screenshot(&mut self, path: &Path) {
-        let expression = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))";
-        self.evaluate(expression);
-        let data = self.call("Page.captureScreenshot", json!({"format": "png"}))["data"].take();
-        std::fs::write(path, decode_base64(data.as_str().expect("text"))).expect("writable");
-    }
-
-    /// Saves downloads in a folder.
-    pub fn save_downloads(&mut self, folder: &Path) -> PathBuf {
-        let params = json!({"behavior": "allow", "downloadPath": folder.display().to_string()});
-        self.call("Browser.setDownloadBehavior", params);
-        folder.to_path_buf()
-    }
-
-    /// Sets the size of the page in CSS pixels, and its light colours.
-    pub fn set_size(&mut self, [width, height]: [u32; 2]) {
-        let metrics = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
-        self.call("Emulation.setDeviceMetricsOverride", metrics);
-        let features = json!({"features": [{"name": "prefers-color-scheme", "value": "light"}]});
-        self.call("Emulation.setEmulatedMedia", features);
-    }
 }
 
 impl Drop for Chromium {
@@ -168,21 +149,4 @@ impl Drop for Chromium {
         drop(self.child.kill());
         drop(self.child.wait());
     }
-}
-
-/// Decodes base64 with padding.
-pub fn decode_base64(text: &str) -> Vec<u8> {
-    let value = |c: u8| match c {
-        b'A'..=b'Z' => u32::from(c - b'A'),
-        b'a'..=b'z' => u32::from(c - b'a') + 26,
-        b'0'..=b'9' => u32::from(c - b'0') + 52,
-        b'+' => 62,
-        _ => 63,
-    };
-    let digits: Vec<u8> = text.bytes().filter(|c| *c != b'=').collect();
-    let bytes = digits.chunks(4).flat_map(|four| {
-        let bits = four.iter().fold(0, |sum, c| sum << 6 | value(*c)) << (6 * (4 - four.len()));
-        bits.to_be_bytes()[1..four.len()].to_vec()
-    });
-    bytes.collect()
 }

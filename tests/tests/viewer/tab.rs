@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::process::{Child, ChildStdout, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
@@ -79,19 +79,7 @@ impl Drop for Viewer {
 pub struct Tab {
     socket: WebSocket<TcpStream>,
     pub scene: Value,
-    pub seq: u64,
-}
-
-/// A rendered frame and the time from its camera to its bytes.
-pub struct Picture {
-    pub header: Value,
-    pub latency_ms: f64,
-}
-
-impl Picture {
-    pub fn render_ms(&self) -> f64 {
-        ["select_ms", "render_ms"].iter().map(|key| self.header[*key].as_f64().expect("a time")).sum()
-    }
+    seq: u64,
 }
 
 impl Tab {
@@ -99,9 +87,9 @@ impl Tab {
         let origin = format!("http://{}", viewer.host);
         let socket = viewer.socket(&viewer.host, &origin, &viewer.token).expect("the page's own request is accepted");
         let mut tab = Self { socket, scene: Value::Null, seq: 0 };
-        assert_eq!(tab.reply().0["type"], "hello");
+        assert_eq!(tab.reply()["type"], "hello");
         tab.send(&json!({"type": "open", "scene": 0, "stored": null}));
-        tab.scene = tab.reply().0;
+        tab.scene = tab.reply();
         assert_eq!(tab.scene["type"], "scene", "{}", tab.scene);
         tab
     }
@@ -110,12 +98,11 @@ impl Tab {
         self.socket.send(Message::text(message.to_string())).expect("the socket is open");
     }
 
-    /// Receives a reply: header and bytes after it.
-    pub fn reply(&mut self) -> (Value, Vec<u8>) {
+    /// Receives the header of a reply.
+    pub fn reply(&mut self) -> Value {
         let message = self.socket.read().expect("a reply within the time limit").into_data();
         let (length, rest) = message.split_first_chunk::<4>().expect("a length");
-        let (header, parts) = rest.split_at(u32::from_le_bytes(*length) as usize);
-        (serde_json::from_slice(header).expect("JSON"), parts.to_vec())
+        serde_json::from_slice(&rest[..u32::from_le_bytes(*length) as usize]).expect("JSON")
     }
 
     pub fn send_view(&mut self, tokens: u64) {
@@ -131,48 +118,12 @@ impl Tab {
         self.send(&view);
     }
 
-    pub fn acknowledge(&mut self, header: &Value) {
-        self.send(&json!({"type": "ack", "seq": header["seq"]}));
-    }
-
-    /// Moves the camera and waits for its picture.
-    pub fn picture(&mut self, tokens: u64) -> Picture {
-        let started = Instant::now();
+    /// Moves the camera, waits for its picture, and returns the header of that.
+    pub fn picture(&mut self, tokens: u64) -> Value {
         self.send_view(tokens);
-        let (header, _) = self.reply();
-        let latency_ms = 1e3 * started.elapsed().as_secs_f64();
-        assert_eq!(header["type"], "frame", "{header}");
-        assert_eq!(header["seq"], self.seq);
-        self.acknowledge(&header);
-        Picture { header, latency_ms }
-    }
-
-    /// Frames per second of a tab that always has another camera, over `seconds`.
-    pub fn frame_rate(&mut self, tokens: u64, seconds: f64) -> f64 {
-        let started = Instant::now();
-        let mut count = 0;
-        self.send_view(tokens);
-        self.send_view(tokens);
-        while started.elapsed().as_secs_f64() < seconds {
-            let (header, _) = self.reply();
-            count += 1;
-            self.acknowledge(&header);
-            self.send_view(tokens);
-        }
-        let rate = f64::from(count) / started.elapsed().as_secs_f64();
-        self.drain();
-        rate
-    }
-
-    /// Receives the frames that are still under way.
-    fn drain(&mut self) {
-        let last = self.seq;
-        loop {
-            let (header, _) = self.reply();
-            self.acknowledge(&header);
-            if header["seq"] == last {
-                return;
-            }
-        }
+        let header = self.reply();
+        assert_eq!((&header["type"], &header["seq"]), (&"frame".into(), &self.seq.into()), "{header}");
+        self.send(&json!({"type": "ack", "seq": self.seq}));
+        header
     }
 }

@@ -16,12 +16,6 @@ pub enum BenchCase {
     Condense,
     /// The attention of equation 2 without projections.
     ClusterAttention,
-    /// Algorithm 1: half of one scene's stored tokens for one view.
-    Select,
-    /// One scene's stored tokens to the words of a coded scene file.
-    CodeTokens,
-    /// The words of a coded scene file to tokens.
-    DecodeTokens,
     /// Renderer: one view of one scene from all its tokens.
     Render,
     /// Renderer: eight views of one scene in one call, with shared tokens; seconds are per view.
@@ -29,8 +23,6 @@ pub enum BenchCase {
     Render8Views,
     /// An update of stage 1.
     Stage1Step,
-    /// An update of stage 1 with a small network of fixed size.
-    Stage1StepTiny,
     /// An update of stage 2.
     Stage2Step,
 }
@@ -49,14 +41,14 @@ impl BenchCase {
         Self::ALL.iter().map(|case| case.name()).collect::<Vec<_>>().join(", ")
     }
 
-    /// Whether the case clusters, condenses or selects tokens.
+    /// Whether the case clusters or condenses tokens.
     pub const fn needs_clusters(self) -> bool {
         !matches!(self, Self::Encode | Self::Render | Self::Render8Views | Self::Stage1Step)
     }
 
     /// Whether the error is measured on a smaller problem than the time.
     pub const fn is_checked_reduced(self) -> bool {
-        matches!(self, Self::Stage1Step | Self::Stage1StepTiny | Self::Stage2Step)
+        matches!(self, Self::Stage1Step | Self::Stage2Step)
     }
 }
 

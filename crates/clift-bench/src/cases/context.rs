@@ -1,15 +1,14 @@
 //! Options of a benchmark; sizes, device and shared inputs of its rows.
 
 use std::cell::OnceCell;
-use std::path::PathBuf;
 use std::time::Instant;
 
 use burn::module::Module;
 use burn::tensor::Device;
 use clift_core::BadConfig;
-use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
-use clift_model::{DeviceName, ModelConfig, Network, TokenCount, Tokens, Views};
-use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
+use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig};
+use clift_model::{DeviceName, Network, TokenCount, Tokens, Views};
+use clift_train::{ClipShape, Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
 use crate::cases::task::BenchTask;
@@ -31,30 +30,14 @@ pub struct BenchOptions {
     pub error: bool,
     /// Stored tokens of a scene.
     pub stored_tokens: TokenCount,
-    /// Tokens from which a view is rendered; `None` for all of a scene.
-    pub render: Option<TokenCount>,
-    /// Input of K-means: a safetensors file with the tensor `features`, `[N, D]` in f32; `None` for the encoder's tokens.
-    pub features: Option<PathBuf>,
 }
 
-impl BenchOptions {
-    /// One timed repetition of each case, without warm-up and f64 check, with all tokens stored.
-    pub fn new(cases: Vec<BenchCase>) -> Self {
-        let stored_tokens = TokenCount::Share(1.0);
-        Self { cases, repeats: 1, warmup: 0, error: false, stored_tokens, render: None, features: None }
-    }
-}
-
-/// Sizes, device and inputs shared by all rows.
 pub struct BenchContext {
     pub config: Config,
     /// Device of the tensors, without autodiff.
     pub device: Device,
-    /// Whether tensors are in the memory of this process.
     pub is_cpu: bool,
-    stored_tokens: TokenCount,
-    render: Option<TokenCount>,
-    pub features: Option<PathBuf>,
+    pub options: BenchOptions,
     /// Tokens of one scene, computed once.
     lift: OnceCell<Tokens>,
 }
@@ -70,43 +53,10 @@ impl BenchContext {
         config.validate()?;
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;
-        let context = Self {
-            device,
-            is_cpu: config.device.is_cpu(),
-            stored_tokens: options.stored_tokens,
-            render: options.render,
-            features: options.features.clone(),
-            lift: OnceCell::new(),
-            config,
-        };
-        // K-means of a file clusters the tokens of the file.
-        if options.features.is_none() || options.cases.iter().any(|case| *case != BenchCase::Kmeans) {
-            context.num_storage_tokens()?;
-        }
-        context.num_render_tokens()?;
+        let context =
+            Self { device, is_cpu: config.device.is_cpu(), options: options.clone(), lift: OnceCell::new(), config };
+        context.num_storage_tokens()?;
         Ok(context)
-    }
-
-    fn with(&self, config: Config) -> Self {
-        let (device, is_cpu, stored_tokens) = (self.device.clone(), self.is_cpu, self.stored_tokens);
-        Self { config, device, is_cpu, stored_tokens, render: None, features: None, lift: OnceCell::new() }
-    }
-
-    /// Returns the small network of `stage1_step_tiny`: 256 tokens, 64 target patches, batch 8 for every config.
-    pub fn tiny(&self) -> Self {
-        let model = ModelConfig {
-            dim: 128,
-            num_heads: 8,
-            feed_forward_dim: 341,
-            num_encoder_blocks: 3,
-            num_renderer_blocks: 3,
-            ..ModelConfig::default()
-        };
-        let views = ViewSampler { min_context: 4, num_targets: 1, ..ViewSampler::default() };
-        let data = DataConfig { width: 64, height: 64, views, ..DataConfig::default() };
-        let stage1 = Stage1Config { batch_size: 8, accumulate: 1, ..Stage1Config::default() };
-        let Config { seed, device, precision, .. } = self.config;
-        self.with(Config { seed, device, precision, data, model, stage1, ..Config::default() })
     }
 
     /// Returns the same network on at most [`MAX_CHECKED_TOKENS`] tokens: smaller images, then fewer scenes and views.
@@ -125,11 +75,11 @@ impl BenchContext {
         let num_scenes = (MAX_CHECKED_TOKENS / tokens(data)).max(1);
         stage1.batch_size = stage1.batch_size.min(num_scenes);
         stage2.batch_size = stage2.batch_size.min(num_scenes);
-        let mut reduced = self.with(config);
-        if let TokenCount::Count(count) = self.stored_tokens {
-            reduced.stored_tokens = TokenCount::Share(count as f64 / self.num_tokens()? as f64);
+        let (device, mut options) = (self.device.clone(), self.options.clone());
+        if let TokenCount::Count(count) = options.stored_tokens {
+            options.stored_tokens = TokenCount::Share(count as f64 / self.num_tokens()? as f64);
         }
-        Ok(reduced)
+        Ok(Self { config, device, is_cpu: self.is_cpu, options, lift: OnceCell::new() })
     }
 
     pub fn num_tokens(&self) -> Result<usize, TrainError> {
@@ -138,24 +88,12 @@ impl BenchContext {
     }
 
     pub fn num_storage_tokens(&self) -> Result<usize, TrainError> {
-        self.stored_of(self.num_tokens()?)
-    }
-
-    pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
         let all = self.num_tokens()?;
-        let Some(count) = self.render else { return Ok(all) };
-        count.of(all).map_err(|error| BadConfig::new("--render", count, error.to_string()).into())
-    }
-
-    pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
-        self.stored_tokens.of(num_tokens).map_err(|error| {
-            let hint = if self.features.is_some() { "; --case kmeans alone uses the tokens of --features" } else { "" };
-            self.bad_stored_tokens(&format!("{error}{hint}"))
-        })
+        self.options.stored_tokens.of(all).map_err(|error| self.bad_stored_tokens(&error.to_string()))
     }
 
     pub fn bad_stored_tokens(&self, fix: &str) -> TrainError {
-        BadConfig::new("--stored-tokens", self.stored_tokens, fix).into()
+        BadConfig::new("--stored-tokens", self.options.stored_tokens, fix).into()
     }
 
     pub fn shape(&self) -> ClipShape {

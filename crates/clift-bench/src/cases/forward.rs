@@ -4,43 +4,36 @@
 use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use clift_core::{step_rng, uniform_below};
-use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer, Tokens, Views, cluster_attention};
+use clift_model::{Cameras, Clusters, Views, cluster_attention};
 use clift_train::{TrainError, seeded_clusters, seeded_uniform};
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{ToF64, Weights, relative_error};
+use crate::cases::reference::{ToF64, module_on, relative_error};
 use crate::cases::task::BenchTask;
 
-/// A computation without gradient, with a numeric result.
-pub struct Forward<I> {
-    inputs: I,
-    /// Computes the result, flattened.
-    compute: fn(&I) -> Tensor<1>,
+/// Returns a result, flattened; computed in f64 on the reference device if one is given.
+type Compute = dyn Fn(Option<&Device>) -> Tensor<1>;
+
+pub struct Forward {
+    compute: Box<Compute>,
     /// Divisor of the seconds of a repetition.
     num_views: usize,
 }
 
-impl<I> Forward<I> {
-    fn new(inputs: I, compute: fn(&I) -> Tensor<1>) -> Self {
-        Self { inputs, compute, num_views: 1 }
-    }
-
-    pub fn forward(&self) -> Tensor<1> {
-        (self.compute)(&self.inputs)
+impl Forward {
+    fn new(compute: impl Fn(Option<&Device>) -> Tensor<1> + 'static) -> Self {
+        Self { compute: Box::new(compute), num_views: 1 }
     }
 }
 
-impl<I: ToF64> BenchTask for Forward<I> {
+impl BenchTask for Forward {
     fn run(&mut self) -> Result<(), TrainError> {
-        self.forward();
+        (self.compute)(None);
         Ok(())
     }
 
-    fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
-        let (result, compute) = (self.forward(), self.compute);
-        let inputs = self.inputs.in_f64(reference);
-        drop(self);
-        Ok(Some(relative_error(result, compute(&inputs))))
+    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError> {
+        Ok(relative_error((self.compute)(None), (self.compute)(Some(reference))))
     }
 
     fn num_views(&self) -> usize {
@@ -48,42 +41,27 @@ impl<I: ToF64> BenchTask for Forward<I> {
     }
 }
 
-/// Encoder: context views to tokens.
-pub fn encode(context: &BenchContext) -> Result<Forward<(Weights<Encoder>, Views)>, TrainError> {
+pub fn encode(context: &BenchContext) -> Result<Forward, TrainError> {
     let views = Views::upload(&[&context.clip(1).context], &context.device)?;
-    let encoder = Weights(context.model().encoder.valid());
-    Ok(Forward::new((encoder, views), |(encoder, views)| encoder.0.forward(views).values.flatten(0, 2)))
+    let encoder = context.model().encoder.valid();
+    Ok(Forward::new(move |reference| module_on(&encoder, reference).forward(&views.on(reference)).values.flatten(0, 2)))
 }
 
-/// Clusters with their indices on a device.
-pub struct UploadedClusters {
-    clusters: Clusters,
-    index: ClusterIndex,
-}
-
-impl ToF64 for UploadedClusters {
-    fn in_f64(&self, reference: &Device) -> Self {
-        Self { clusters: self.clusters.clone(), index: self.clusters.upload(reference) }
-    }
-}
-
-/// Condenser: tokens and clusters to condensed tokens.
-pub fn condense(context: &BenchContext) -> Result<Forward<(Weights<Condenser>, Tokens, UploadedClusters)>, TrainError> {
+pub fn condense(context: &BenchContext) -> Result<Forward, TrainError> {
     let lift = context.lift()?;
     let count = context.num_storage_tokens()?;
     let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.config.seed, 0)?])?;
-    let clusters = UploadedClusters { index: clusters.upload(&context.device), clusters };
-    let condenser = Weights(context.model().condenser.valid());
-    Ok(Forward::new((condenser, lift, clusters), |(condenser, lift, clusters)| {
-        condenser.0.forward(lift.clone(), &clusters.index).values.flatten(0, 2)
+    let index = clusters.upload(&context.device);
+    let condenser = context.model().condenser.valid();
+    Ok(Forward::new(move |reference| {
+        let moved = reference.map(|reference| clusters.upload(reference));
+        let index = moved.as_ref().unwrap_or(&index);
+        module_on(&condenser, reference).forward(lift.on(reference), index).values.flatten(0, 2)
     }))
 }
 
-/// Query, key with value, the centroid of every member, and the number of heads.
-type AttentionInputs = ([Tensor<3>; 2], Tensor<1, Int>, usize);
-
 /// Attention of every centroid to its members, on random projections.
-pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward<AttentionInputs>, TrainError> {
+pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward, TrainError> {
     let (count, dim) = (context.num_storage_tokens()?, context.config.model.dim);
     let num_members = context.num_tokens()? - count;
     if num_members == 0 {
@@ -95,25 +73,22 @@ pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward<Attention
     };
     let mut rng = step_rng(context.config.seed, 0, "bench segments");
     let segment: Vec<i64> = (0..num_members).map(|_| uniform_below(&mut rng, count) as i64).collect();
-    let segment = Tensor::from_data(TensorData::new(segment, [num_members]), &context.device);
-    let tokens = [random(count, dim, "bench query"), random(num_members, 2 * dim, "bench key and value")];
-    let inputs = (tokens, segment, context.config.model.num_heads);
-    Ok(Forward::new(inputs, |([query, key_value], segment, num_heads)| {
-        cluster_attention(query.clone(), key_value.clone(), segment.clone(), *num_heads).flatten(0, 2)
+    let segment = Tensor::<1, Int>::from_data(TensorData::new(segment, [num_members]), &context.device);
+    let query: Tensor<3> = random(count, dim, "bench query");
+    let key_value: Tensor<3> = random(num_members, 2 * dim, "bench key and value");
+    let num_heads = context.config.model.num_heads;
+    Ok(Forward::new(move |reference| {
+        let segment = reference.map_or_else(|| segment.clone(), |reference| segment.clone().to_device(reference));
+        cluster_attention(query.on(reference), key_value.on(reference), segment, num_heads).flatten(0, 2)
     }))
 }
 
-/// Renderer: the first tokens of a scene and cameras to images.
-pub fn render(
-    context: &BenchContext,
-    num_views: usize,
-) -> Result<Forward<(Weights<Renderer>, Tokens, Cameras)>, TrainError> {
-    let ids: Vec<u32> = (0..context.num_render_tokens()? as u32).collect();
-    let lift = context.lift()?.select(&ids);
+pub fn render(context: &BenchContext, num_views: usize) -> Result<Forward, TrainError> {
+    let lift = context.lift()?;
     let targets = Cameras::upload(&[&context.clip(num_views).target], &context.device)?;
-    let renderer = Weights(context.model().renderer.valid());
-    let render = Forward::new((renderer, lift, targets), |(renderer, lift, targets)| {
-        renderer.0.forward(lift.clone(), targets).flatten(0, 4)
+    let renderer = context.model().renderer.valid();
+    let render = Forward::new(move |reference| {
+        module_on(&renderer, reference).forward(lift.on(reference), &targets.on(reference)).flatten(0, 4)
     });
     Ok(Forward { num_views, ..render })
 }

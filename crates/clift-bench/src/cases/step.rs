@@ -13,7 +13,6 @@ use crate::cases::context::BenchContext;
 use crate::cases::reference::{ToF64, flat_gradient, largest_magnitude, module_in_f64, values};
 use crate::cases::task::BenchTask;
 
-/// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
 pub struct StepCase {
     stage: Stage,
     /// `None` during a step and after one that failed.
@@ -48,14 +47,9 @@ fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
         optimizer: StageOptimizer::new(context.config.stage(stage).optimizer, &context.device),
         device: context.device.clone().autodiff(),
         loss: Loss::default(),
-        activation_checkpointing: context.config.activation_checkpointing,
         precision: context.config.precision,
         loss_scale: LossScale::of(context.config.precision),
     }
-}
-
-pub(crate) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageBatch, TrainError> {
-    stage_batch(context, stage, context.config.stage(stage).micro_batch_size())
 }
 
 /// Makes a batch with all tokens (stage 1) or with stored tokens (stage 2).
@@ -78,12 +72,12 @@ impl BenchTask for StepCase {
         Err(TrainError::Diverged { count: 1, step: 1, reason, keys, checkpoint })
     }
 
-    fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
+    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError> {
         let Self { stage, reduced, .. } = *self;
         let batch_size = reduced.config.stage(stage).batch_size;
         let batch = stage_batch(&reduced, stage, batch_size)?;
         let model = freeze(stage, reduced.model());
-        Ok(Some(update_error(&model, &batch, &reduced.device, reference, 0.0)?))
+        update_error(&model, &batch, &reduced.device, reference, 0.0)
     }
 }
 

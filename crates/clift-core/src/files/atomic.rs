@@ -107,25 +107,21 @@ mod tests {
     use crate::testing::names;
 
     #[test]
-    fn replaced_files_leave_no_temporary_files() {
+    fn replaced_files_leave_no_temporary_files_and_have_ordinary_permissions() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a.json");
+        let path = folder.path().join("ours");
         replace_file(&path, b"old").unwrap();
         replace_file(&path, b"new").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
-        assert_eq!(names(folder.path()), ["a.json"]);
-        assert!(replace_file(&folder.path().join("missing/a.json"), b"x").is_err());
-    }
-
-    #[cfg(unix)]
-    #[test]
-    fn replaced_files_have_ordinary_permissions() {
-        use std::os::unix::fs::PermissionsExt;
-        let folder = tempfile::tempdir().unwrap();
-        let mode = |name: &str| std::fs::metadata(folder.path().join(name)).unwrap().permissions().mode();
-        replace_file(&folder.path().join("ours"), b"x").unwrap();
         std::fs::write(folder.path().join("plain"), b"x").unwrap();
-        assert_eq!(mode("ours"), mode("plain"));
+        assert_eq!(names(folder.path()), ["ours", "plain"]);
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            let mode = |name: &str| std::fs::metadata(folder.path().join(name)).unwrap().permissions().mode();
+            assert_eq!(mode("ours"), mode("plain"));
+        }
+        assert!(replace_file(&folder.path().join("missing/a.json"), b"x").is_err());
     }
 
     #[test]
@@ -143,26 +139,16 @@ mod tests {
     }
 
     #[test]
-    fn folders_are_made_with_their_parents() {
+    fn folders_are_made_with_their_parents_and_removed_with_former_remains() {
         let root = tempfile::tempdir().unwrap();
         for path in ["a/b/c", "a/b/c", "a/b/d"] {
             make_folder(&root.path().join(path)).unwrap();
         }
         assert_eq!(names(&root.path().join("a/b")), ["c", "d"]);
-        std::fs::write(root.path().join("file"), b"x").unwrap();
-        assert!(make_folder(&root.path().join("file/a")).is_err());
-    }
-
-    #[test]
-    fn folders_are_removed_with_former_remains() {
-        let root = tempfile::tempdir().unwrap();
-        for name in ["step-1", "step-1.tmp"] {
-            std::fs::create_dir(root.path().join(name)).unwrap();
-            std::fs::write(root.path().join(name).join("model"), b"weights").unwrap();
-        }
-        remove_folder(&root.path().join("step-1")).unwrap();
+        std::fs::create_dir(root.path().join("a.tmp")).unwrap();
+        remove_folder(&root.path().join("a")).unwrap();
         assert!(names(root.path()).is_empty());
-        assert!(remove_folder(&root.path().join("step-1")).is_err());
+        assert!(remove_folder(&root.path().join("a")).is_err());
     }
 
     #[test]

@@ -40,19 +40,12 @@ impl Intrinsics {
     }
 
     /// Checks that focal lengths are positive and all numbers finite.
-    ///
-    /// # Errors
-    /// [`CameraError::BadCamera`] with the first number that fails.
     pub fn validate(self) -> Result<(), CameraError> {
         let Self { fx, fy, cx, cy } = self;
-        for (name, focal) in [("fx", fx), ("fy", fy)] {
-            if !(focal.is_finite() && focal > 0.0) {
-                return Err(CameraError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
-            }
-        }
-        for (name, centre) in [("cx", cx), ("cy", cy)] {
-            if !centre.is_finite() {
-                return Err(CameraError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
+        let [focal, centre] = ["a positive number", "a finite number"];
+        for (name, value, expected) in [("fx", fx, focal), ("fy", fy, focal), ("cx", cx, centre), ("cy", cy, centre)] {
+            if !value.is_finite() || (expected == focal && value <= 0.0) {
+                return Err(CameraError::BadCamera { what: format!("{name} is {value}, expected {expected}") });
             }
         }
         Ok(())
@@ -74,9 +67,6 @@ impl IntrinsicsNorm {
     }
 
     /// Checks that focal lengths are positive and all numbers finite.
-    ///
-    /// # Errors
-    /// [`CameraError::BadCamera`] with the first number that fails.
     pub fn validate(self) -> Result<(), CameraError> {
         Intrinsics::from(self.to_array()).validate()
     }
@@ -135,9 +125,6 @@ impl Camera {
 impl Camera<IntrinsicsNorm> {
     /// Converts the 18 numbers of a RealEstate10K frame: `fx fy cx cy` over width and height, two placeholders
     /// (ignored), then `w2c` as 3 x 4, row-major, OpenCV axes. `c2w` is the matrix inverse of `w2c`.
-    ///
-    /// # Errors
-    /// [`CameraError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
     pub fn from_re10k(row: [f64; 18]) -> Result<Self, CameraError> {
         let [fx, fy, cx, cy, ..] = row;
         let intrinsics = IntrinsicsNorm { fx, fy, cx, cy };
@@ -215,26 +202,25 @@ mod tests {
         let mut row = LOOKS_ALONG_X;
         row[..4].copy_from_slice(&[0.5, 1.0, 0.5, 0.5]);
         let (x, y) = Camera::from_re10k(row).unwrap().fov_deg();
-        assert!((x - 90.0).abs() < 1e-12, "{x}");
-        assert!((y - 53.130_102_354_155_98).abs() < 1e-12, "{y}"); // 2 atan(1/2)
+        assert!((x - 90.0).abs() < 1e-12 && (y - 53.130_102_354_155_98).abs() < 1e-12, "{x} {y}"); // 2 atan(1/2)
     }
 
     #[test]
     fn invalid_row_names_the_first_invalid_number() {
-        let message = |index: usize, value: f64| {
+        for (index, value, expected) in [
+            (1, -0.5, "bad camera: fy is -0.5, expected a positive number"),
+            (3, f64::INFINITY, "bad camera: cy is inf, expected a finite number"),
+            (9, f64::NEG_INFINITY, "bad camera: the pose holds -inf"),
+            (11, -1.0, "mirrors"),
+            (11, 2.0, "off an orthonormal one by 3.000e0"),
+        ] {
             let mut row = LOOKS_ALONG_X;
             row[index] = value;
-            Camera::from_re10k(row).unwrap_err().to_string()
-        };
-        assert_eq!(message(0, f64::NAN), "bad camera: fx is NaN, expected a positive number");
-        assert_eq!(message(1, -0.5), "bad camera: fy is -0.5, expected a positive number");
-        assert_eq!(message(3, f64::INFINITY), "bad camera: cy is inf, expected a finite number");
-        assert_eq!(message(9, f64::NEG_INFINITY), "bad camera: the pose holds -inf");
-        assert!(message(11, -1.0).contains("mirrors"), "{}", message(11, -1.0));
-        assert!(message(11, 2.0).contains("off an orthonormal one by 3.000e0"), "{}", message(11, 2.0));
+            let message = Camera::from_re10k(row).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
     }
 
-    /// Returns a camera at (0.5, -0.2, 0.1), rotated by 0.3 about y.
     fn turned() -> Camera {
         let c2w = Pose { rotation: DMat3::from_rotation_y(0.3), translation: DVec3::new(0.5, -0.2, 0.1) };
         Camera { c2w, intrinsics: Intrinsics { fx: 20.0, fy: 22.0, cx: 8.5, cy: 4.0 } }

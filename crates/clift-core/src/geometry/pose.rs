@@ -31,10 +31,6 @@ impl Pose {
     }
 
     /// Converts the upper three rows of a 4 x 4 matrix.
-    ///
-    /// # Errors
-    /// [`CameraError::BadCamera`] for a value that is not finite, for a rotation that departs from an orthonormal one by
-    /// more than 1e-2, and for a determinant below 0.
     pub fn from_rows(rows: &[[f64; 4]; 3]) -> Result<Self, CameraError> {
         let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
         let pose = Self { rotation: DMat3::from_rows(x, y, z), translation: rows.map(|row| row[3]).into() };
@@ -64,20 +60,12 @@ impl Pose {
         Ok(Self { rotation: DMat3::from_cols(rotation.x_axis, -rotation.y_axis, -rotation.z_axis), translation })
     }
 
-    /// Returns the row-major 4 x 4 matrix in f32, the layout of camera tensors.
-    pub fn to_matrix(self) -> [f32; 16] {
-        self.to_matrix_f64().map(|value| value as f32)
-    }
-
     /// Returns the row-major 4 x 4 matrix.
     pub fn to_matrix_f64(self) -> [f64; 16] {
         DMat4::from_mat3_translation(self.rotation, self.translation).to_rows_array()
     }
 
     /// Converts a row-major 4 x 4 matrix.
-    ///
-    /// # Errors
-    /// As [`Pose::from_rows`], and [`CameraError::BadCamera`] for another last row than `[0, 0, 0, 1]`.
     pub fn from_matrix(matrix: &[f64; 16]) -> Result<Self, CameraError> {
         let [x, y, z, last] = [0, 4, 8, 12].map(|start| [0, 1, 2, 3].map(|column| matrix[start + column]));
         if last != [0.0, 0.0, 0.0, 1.0] {
@@ -121,9 +109,6 @@ impl Pose {
     }
 
     /// Checks that all numbers are finite.
-    ///
-    /// # Errors
-    /// [`CameraError::BadCamera`] with the first number that is not.
     pub fn check_finite(self) -> Result<(), CameraError> {
         let mut values = self.rotation.to_rows_array().into_iter().chain(self.translation.to_array());
         match values.find(|value| !value.is_finite()) {

@@ -1,10 +1,13 @@
 //! Runs candidates: compiles, compares with f64, times and prints.
 
+use std::cell::OnceCell;
 use std::fmt::Write;
 use std::time::{Duration, Instant};
 
 use clift_cube::Buffer;
 use cubecl::prelude::Client;
+
+use crate::cases::Case;
 
 /// Time of launches before the samples: a GPU raises its clocks only under load.
 const WARM_UP: Duration = Duration::from_millis(300);
@@ -13,18 +16,6 @@ const SAMPLE: Duration = Duration::from_millis(4);
 /// Time of all samples.
 const TOTAL: Duration = Duration::from_millis(100);
 const MAX_SAMPLES: usize = 15;
-
-/// Work of a candidate, of which its rate is computed.
-#[derive(Clone, Copy)]
-pub enum Work {
-    /// Floating-point operations.
-    Flops(f64),
-    /// Values in f32 of the inputs and results.
-    Values(f64),
-}
-
-/// Sampled values of a result, computed and expected.
-pub type Pairs = Vec<(f64, f64)>;
 
 /// Candidates in their order; those before `first` are not run.
 pub struct Sweep<'a> {
@@ -38,51 +29,54 @@ impl<'a> Sweep<'a> {
         Self { client, first, index: 0 }
     }
 
-    /// Runs a candidate and prints its results; `check` returns samples of every result. Ends the process if it fails.
-    pub fn run(
+    /// Runs a kernel with every tile and prints the results; `make` returns its computation, in a small size (true) for the
+    /// comparison with f64 or in full, which takes `flops` operations. Ends the process if a candidate fails.
+    pub fn run<T: Copy>(
         &mut self,
         kernel: &str,
         case: &str,
-        tile: &str,
-        work: Work,
-        launch: impl Fn() -> Vec<Buffer>,
-        check: impl Fn(&[Buffer]) -> Result<Vec<Pairs>, String>,
+        flops: f64,
+        tiles: &[(String, T)],
+        make: impl Fn(T, bool) -> Case,
     ) {
-        let index = self.index;
-        self.index += 1;
-        if index < self.first {
-            return;
-        }
-        let mut line = format!("{{\"index\":{index},\"kernel\":\"{kernel}\",\"case\":\"{case}\",\"tile\":\"{tile}\"");
-        println!("{line},\"state\":\"starts\"}}");
-        let measured = self.measure(work, launch, check);
-        match &measured {
-            Ok(fields) => line.push_str(fields),
-            Err(error) => {
-                let readable = |c: char| if c.is_control() || "\"\\".contains(c) { ' ' } else { c };
-                let error: String = error.chars().map(readable).take(600).collect();
-                write!(line, ",\"failed\":\"{error}\"").expect("a string grows");
+        let inputs = OnceCell::new();
+        for (name, tile) in tiles {
+            let index = self.index;
+            self.index += 1;
+            if index < self.first {
+                continue;
             }
-        }
-        println!("{line}}}");
-        if measured.is_err() {
-            std::process::exit(3);
+            let mut line =
+                format!("{{\"index\":{index},\"kernel\":\"{kernel}\",\"case\":\"{case}\",\"tile\":\"{name}\"");
+            println!("{line},\"state\":\"starts\"}}");
+            let [small, full] = [true, false].map(|is_small| make(*tile, is_small));
+            let inputs = inputs.get_or_init(|| full.upload(self.client));
+            let measured = self.measure(flops, &small, || (full.run)(self.client, inputs));
+            match &measured {
+                Ok(fields) => line.push_str(fields),
+                Err(error) => {
+                    let readable = |c: char| if c.is_control() || "\"\\".contains(c) { ' ' } else { c };
+                    let error: String = error.chars().map(readable).take(600).collect();
+                    write!(line, ",\"failed\":\"{error}\"").expect("a string grows");
+                }
+            }
+            println!("{line}}}");
+            if measured.is_err() {
+                std::process::exit(3);
+            }
         }
     }
 
-    fn measure(
-        &self,
-        work: Work,
-        launch: impl Fn() -> Vec<Buffer>,
-        check: impl Fn(&[Buffer]) -> Result<Vec<Pairs>, String>,
-    ) -> Result<String, String> {
-        self.wait(&[])?;
+    fn measure(&self, flops: f64, small: &Case, launch: impl Fn() -> Vec<Buffer>) -> Result<String, String> {
+        let inputs = small.upload(self.client);
+        self.wait(&inputs)?;
         let start = Instant::now();
-        let results = launch();
+        let results = (small.run)(self.client, &inputs);
         self.wait(&results)?;
         let first = start.elapsed();
-        let error = check(&results)?.iter().map(error).fold(0.0, f64::max);
-        drop(results);
+        let error = small.errors(self.client, &results)?.into_iter().fold(0.0, f64::max);
+        drop((inputs, results));
+        self.wait(&launch())?;
 
         let sample = |count: u32| -> Result<Duration, String> {
             let start = Instant::now();
@@ -103,15 +97,12 @@ impl<'a> Sweep<'a> {
         }
         samples.sort_by(f64::total_cmp);
         let median = samples[samples.len() / 2];
-        let (rate, unit) = match work {
-            Work::Flops(flops) => (1e-12 * flops / median, "TFLOP/s"),
-            Work::Values(values) => (4e-9 * values / median, "GB/s"),
-        };
+        let rate = 1e-12 * flops / median;
         // JSON cannot represent infinity.
         let error = if error.is_finite() { format!("{error:.2e}") } else { "null".into() };
         let (first, median) = (1e3 * first.as_secs_f64(), 1e3 * median);
         Ok(format!(
-            ",\"first_ms\":{first:.1},\"ms\":{median:.4},\"rate\":{rate:.3},\"unit\":\"{unit}\",\"error\":{error}"
+            ",\"first_ms\":{first:.1},\"ms\":{median:.4},\"rate\":{rate:.3},\"unit\":\"TFLOP/s\",\"error\":{error}"
         ))
     }
 
@@ -120,13 +111,4 @@ impl<'a> Sweep<'a> {
         let handles = results.iter().map(|buffer| &buffer.handle);
         cubecl::future::block_on(self.client.sync_buffers(handles)).map_err(|error| error.to_string())
     }
-}
-
-/// Returns the largest difference over the largest expected value, infinite where a value is not finite.
-fn error(pairs: &Pairs) -> f64 {
-    let size = pairs.iter().map(|(_, expected)| expected.abs()).fold(f64::MIN_POSITIVE, f64::max);
-    let difference = |&(computed, expected): &(f64, f64)| {
-        if computed.is_finite() { (computed - expected).abs() / size } else { f64::INFINITY }
-    };
-    pairs.iter().map(difference).fold(0.0, f64::max)
 }

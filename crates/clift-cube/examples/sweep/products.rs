@@ -1,19 +1,20 @@
 //! Products of the linear layers, forward and backward.
 
-use clift_cube::{Matrices, MatrixShape, MatrixTile, Product, ProductTile, RegisterTile, Values};
+use clift_cube::{MatrixShape, MatrixTile, ProductTile, RegisterTile, Values};
 
 use crate::Sizes;
-use crate::inputs::{Input, read, samples};
-use crate::measure::{Sweep, Work};
+use crate::cases::product;
+use crate::measure::Sweep;
 
-pub fn register_tiles() -> Vec<ProductTile> {
+/// Returns the tiles of registers with their names.
+pub fn register_tiles() -> Vec<(String, ProductTile)> {
     [([128, 128, 16], [8, 8]), ([64, 128, 16], [4, 8]), ([64, 64, 16], [4, 4]), ([128, 128, 8], [8, 8])]
-        .map(|(stage, unit)| ProductTile::Register(RegisterTile { stage, unit }))
+        .map(|(stage, unit)| named(ProductTile::Register(RegisterTile { stage, unit })))
         .into()
 }
 
-/// Returns the tiles of cooperative matrices, without such none.
-pub fn matrix_tiles(shape: Option<MatrixShape>) -> Vec<ProductTile> {
+/// Returns the tiles of cooperative matrices with their names, without such none.
+pub fn matrix_tiles(shape: Option<MatrixShape>) -> Vec<(String, ProductTile)> {
     // Matrices of a stage, planes and buffers.
     let tiles: [([usize; 3], [usize; 2], usize); 11] = [
         ([8, 8, 2], [2, 4], 1),
@@ -29,7 +30,8 @@ pub fn matrix_tiles(shape: Option<MatrixShape>) -> Vec<ProductTile> {
         ([4, 4, 2], [2, 2], 2),
     ];
     let tile = |shape: MatrixShape, (stage, planes, buffers): ([usize; 3], [usize; 2], usize)| {
-        ProductTile::Matrix(MatrixTile { shape, stage: stage.map(|count| count * shape.sizes[0]), planes, buffers })
+        let stage = stage.map(|count| count * shape.sizes[0]);
+        named(ProductTile::Matrix(MatrixTile { shape, stage, planes, buffers }))
     };
     shape.into_iter().flat_map(|shape| tiles.map(|one| tile(shape, one))).collect()
 }
@@ -77,57 +79,26 @@ pub struct LayerProduct {
 
 impl LayerProduct {
     /// Runs tiles on operands in buffers of a type.
-    pub fn run(&self, sweep: &mut Sweep, tiles: &[ProductTile], buffers: Values) {
-        let ([m, n, k], [lhs_transposed, rhs_transposed]) = (self.sizes, self.transposed);
-        let is_rounded = matches!(tiles.first(), Some(ProductTile::Matrix(_)));
-        let input = |seed, len| {
-            let input = Input::new(seed, len);
-            if is_rounded { input.rounded(buffers) } else { input }
-        };
-        let (lhs, rhs) = (input(1, m * k), input(2, k * n));
-        let lhs_at = |i: usize, t: usize| lhs.at(if lhs_transposed { t * m + i } else { i * k + t });
-        let rhs_at = |t: usize, j: usize| rhs.at(if rhs_transposed { j * k + t } else { t * n + j });
-        let client = sweep.client;
+    pub fn run(&self, sweep: &mut Sweep, tiles: &[(String, ProductTile)], buffers: Values) {
+        let [m, n, k] = self.sizes;
         let case = format!("{} {m}x{n}x{k}, {buffers:?}", self.name);
-        for &tile in tiles {
-            let launch = || {
-                let view = |buffer, transposed, rows, columns| Matrices {
-                    transposed,
-                    ..Matrices::contiguous(buffer, if transposed { rows } else { columns })
-                };
-                let lhs = view(lhs.buffer(client), lhs_transposed, m, k);
-                let rhs = view(rhs.buffer(client), rhs_transposed, k, n);
-                vec![Product::new(lhs, rhs, self.sizes).run_tile(client, tile)]
-            };
-            sweep.run(
-                &format!("product, {}", self.part),
-                &case,
-                &name(tile),
-                Work::Flops(2.0 * (m * n * k) as f64),
-                launch,
-                |results| {
-                    let mut pairs = Vec::new();
-                    for i in samples(m, 4) {
-                        let row = read(client, &results[0], i * n, n)?;
-                        // Some million terms in all.
-                        for j in samples(n, (1_000_000 / k).clamp(8, n)) {
-                            pairs.push((row[j], (0..k).map(|t| lhs_at(i, t) * rhs_at(t, j)).sum()));
-                        }
-                    }
-                    Ok(vec![pairs])
-                },
-            );
-        }
+        let flops = 2.0 * (m * n * k) as f64;
+        sweep.run(&format!("product, {}", self.part), &case, flops, tiles, |tile, is_small| {
+            // Long sums of few tiles are split.
+            let sizes = if is_small { [136, 132, 1100] } else { self.sizes };
+            product(tile, sizes, 1, self.transposed, [buffers, buffers, Values::F32], true)
+        });
     }
 }
 
-fn name(tile: ProductTile) -> String {
-    match tile {
+fn named(tile: ProductTile) -> (String, ProductTile) {
+    let name = match tile {
         ProductTile::Register(RegisterTile { stage: [m, n, k], unit: [rows, columns] }) => {
             format!("{m}x{n}x{k}, unit {rows}x{columns}")
         }
         ProductTile::Matrix(MatrixTile { stage: [m, n, k], planes: [rows, columns], buffers, .. }) => {
             format!("{m}x{n}x{k}, planes {rows}x{columns}, {buffers} buffers")
         }
-    }
+    };
+    (name, tile)
 }

@@ -33,13 +33,6 @@ impl ClusterSizes {
     }
 }
 
-/// Members grouped by segment: their order, and the first of every segment.
-#[derive(Clone, Debug)]
-struct Groups {
-    order: Buffer,
-    first: Buffer,
-}
-
 /// Sorts the members of a scene by segment: counts the members before each.
 #[cube(launch_unchecked)]
 fn group(segment: &[i32], order: &mut [u32], first: &mut [u32], batch: usize, num_segments: usize, num_members: usize) {
@@ -71,7 +64,8 @@ fn group(segment: &[i32], order: &mut [u32], first: &mut [u32], batch: usize, nu
     }
 }
 
-fn groups(client: &Client, sizes: ClusterSizes, segment: &Buffer) -> Groups {
+/// Returns members grouped by segment: their order, and the first of every segment.
+fn groups(client: &Client, sizes: ClusterSizes, segment: &Buffer) -> [Buffer; 2] {
     let ClusterSizes { batch, num_segments, num_members, .. } = sizes;
     // Indices have the size of f32 values.
     let order = Buffer::empty(client, batch * num_members, Values::F32);
@@ -90,7 +84,7 @@ fn groups(client: &Client, sizes: ClusterSizes, segment: &Buffer) -> Groups {
             num_members,
         );
     }
-    Groups { order, first }
+    [order, first]
 }
 
 /// Returns the end of a segment's members.
@@ -244,7 +238,7 @@ pub fn cluster_attention_forward(
     [query, key_value, segment]: [&Buffer; 3],
 ) -> [Buffer; 2] {
     let ClusterSizes { batch, num_segments, num_members, num_heads, head_width } = sizes;
-    let Groups { order, first } = groups(client, sizes, segment);
+    let [order, first] = groups(client, sizes, segment);
     let output = Buffer::empty(client, query.len, Values::F32);
     let weights = Buffer::empty(client, batch * num_members * num_heads, Values::F32);
     let vector = sizes.vector();
@@ -281,7 +275,7 @@ pub fn cluster_attention_backward(
     grad_output: &Buffer,
 ) -> [Buffer; 2] {
     let ClusterSizes { batch, num_segments, num_members, num_heads, head_width } = sizes;
-    let Groups { order, first } = groups(client, sizes, segment);
+    let [order, first] = groups(client, sizes, segment);
     let [grad_query, grad_key_value] = [query, key_value].map(|x| Buffer::empty(client, x.len, Values::F32));
     let vector = sizes.vector();
     // SAFETY: as in the forward.
@@ -314,7 +308,8 @@ pub fn cluster_attention_backward(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{client, random, read, upload, worst};
+    use crate::testing::row_cases::cluster_attention;
+    use crate::testing::{check, client};
 
     /// Uneven segments, one of one member, one without; two scenes.
     const SEGMENTS: [i32; 14] = [0, 0, 2, 0, 1, 2, 0, 5, 7, 7, 5, 4, 5, 4];
@@ -322,49 +317,10 @@ mod tests {
     #[test]
     fn outputs_and_gradients_equal_f64() {
         let Some(client) = client() else { return };
-        let bytes: Vec<u8> = SEGMENTS.iter().flat_map(|x| x.to_le_bytes()).collect();
-        let segment = Buffer { handle: client.create_from_slice(&bytes), len: SEGMENTS.len(), values: Values::F32 };
-        for (num_heads, width) in [(2, 12), (1, 5)] {
-            let dim = num_heads * width;
-            let sizes = ClusterSizes { batch: 2, num_segments: 4, num_members: 7, num_heads, head_width: width };
-            let [query, key_value, grad] =
-                [(8 * dim, 1), (14 * 2 * dim, 2), (8 * dim, 3)].map(|(len, seed)| random(len, seed));
-            let [q, kv, g] = [&query, &key_value, &grad].map(|x| upload(&client, x, Values::F32));
-            let [output, weights] = cluster_attention_forward(&client, sizes, [&q, &kv, &segment]);
-            let [grad_q, grad_kv] =
-                cluster_attention_backward(&client, sizes, [&q, &kv, &segment], [&output, &weights], &g);
-
-            let mut expected = [vec![0.0; 8 * dim], vec![0.0; 8 * dim], vec![0.0; 28 * dim]];
-            let scale = 1.0 / (width as f64).sqrt();
-            for segment in 0..8 {
-                for h in 0..num_heads {
-                    let at = |x: &[f32], row: usize| -> Vec<f64> {
-                        x[row * dim + h * width..][..width].iter().map(|&x| f64::from(x)).collect()
-                    };
-                    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-                    let members: Vec<usize> = (0..14).filter(|&i| SEGMENTS[i] == segment as i32).collect();
-                    let q = at(&query, segment);
-                    let exponentials: Vec<f64> =
-                        members.iter().map(|&i| (scale * dot(&q, &at(&key_value, 2 * i))).exp()).collect();
-                    let total: f64 = exponentials.iter().sum();
-                    let grad = at(&grad, segment);
-                    let products: Vec<f64> = members.iter().map(|&i| dot(&grad, &at(&key_value, 2 * i + 1))).collect();
-                    let delta: f64 = exponentials.iter().zip(&products).map(|(w, p)| w / total * p).sum();
-                    for (n, &i) in members.iter().enumerate() {
-                        let weight = exponentials[n] / total;
-                        let slope = scale * weight * (products[n] - delta);
-                        for e in 0..width {
-                            let column = h * width + e;
-                            expected[0][segment * dim + column] += weight * at(&key_value, 2 * i + 1)[e];
-                            expected[1][segment * dim + column] += slope * at(&key_value, 2 * i)[e];
-                            expected[2][2 * i * dim + column] = slope * q[e];
-                            expected[2][(2 * i + 1) * dim + column] = weight * grad[e];
-                        }
-                    }
-                }
-            }
-            for (computed, expected) in [output, grad_q, grad_kv].iter().zip(&expected) {
-                assert!(worst(&read(&client, computed), expected) < 2e-6);
+        for (num_heads, head_width) in [(2, 12), (1, 5)] {
+            let sizes = ClusterSizes { batch: 2, num_segments: 4, num_members: 7, num_heads, head_width };
+            for is_backward in [false, true] {
+                check(&client, &cluster_attention(sizes, SEGMENTS.into(), is_backward), 1e-5);
             }
         }
     }

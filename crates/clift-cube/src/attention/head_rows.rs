@@ -2,7 +2,7 @@
 
 use cubecl::prelude::*;
 
-use crate::buffers::load::Four;
+use crate::buffers::load::{Four, Side};
 
 /// The rows of a buffer.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
@@ -10,6 +10,17 @@ pub(crate) struct Rows {
     pub(crate) start: usize,
     pub(crate) stride: usize,
     pub(crate) count: usize,
+}
+
+/// Rows of an attention, or the gradient of the output in place of the output; the scale of its scores.
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
+pub(crate) struct Attention {
+    pub(crate) query: Rows,
+    pub(crate) key: Rows,
+    pub(crate) value: Rows,
+    pub(crate) output: Rows,
+    pub(crate) num_heads: usize,
+    pub(crate) scale: f32,
 }
 
 /// A scene and the first column of a head.
@@ -24,6 +35,11 @@ impl Rows {
     /// Returns the offset of the head's first row.
     pub(crate) fn start_of(&self, head: &Head) -> usize {
         self.start + head.batch * self.count * self.stride + head.column
+    }
+
+    /// Returns the head's rows from `first`.
+    pub(crate) fn side(&self, head: &Head, first: usize) -> Side {
+        Side { start: self.start_of(head), stride: self.stride, first, limit: self.count }
     }
 }
 

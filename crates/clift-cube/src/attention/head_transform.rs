@@ -99,41 +99,14 @@ pub fn transform_heads(
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::testing::{client, random, read, upload, worst};
+    use crate::testing::row_cases::head_transform;
+    use crate::testing::{check, client};
 
     #[test]
     fn transforms_equal_f64() {
         let Some(client) = client() else { return };
-        let parts = [(false, true, true), (true, false, true), (true, true, false)]
-            .map(|(inverse, transposed, negative)| PartTransform { inverse, transposed, negative });
         for (tokens, num_heads, width) in [(1, 1, 8), (35, 2, 24)] {
-            let x = random(tokens * 3 * num_heads * width, 1);
-            let len = 32 + width / 2;
-            let transforms = random(tokens * len, 2);
-            let [x_, transforms_] = [&x, &transforms].map(|x| upload(&client, x, Values::F32));
-            let output = transform_heads(&client, &parts, [num_heads, width], &transforms_, &x_);
-            let mut expected = vec![0.0; x.len()];
-            for (head, expected) in expected.chunks_exact_mut(width).enumerate() {
-                let part = parts[head / num_heads % 3];
-                let values = &transforms[head / (3 * num_heads) * len..][..len];
-                let x = |i: usize| f64::from(x[head * width + i]);
-                let matrix = &values[if part.inverse { 16 } else { 0 }..];
-                for k in 0..width / 8 {
-                    for j in 0..4 {
-                        let entry = |i: usize| f64::from(matrix[if part.transposed { i * 4 + j } else { j * 4 + i }]);
-                        expected[j * width / 8 + k] = (0..4).map(|i| entry(i) * x(i * width / 8 + k)).sum();
-                    }
-                }
-                for p in 0..width / 4 {
-                    let sign = if part.negative { -1.0 } else { 1.0 };
-                    let (cosine, sine) = (f64::from(values[32 + p]), sign * f64::from(values[32 + width / 4 + p]));
-                    let (a, b) = (width / 2 + p, width / 2 + width / 4 + p);
-                    expected[a] = x(a) * cosine - x(b) * sine;
-                    expected[b] = x(a) * sine + x(b) * cosine;
-                }
-            }
-            assert!(worst(&read(&client, &output), &expected) < 1e-6);
+            check(&client, &head_transform(tokens, [num_heads, width]), 1e-6);
         }
     }
 }

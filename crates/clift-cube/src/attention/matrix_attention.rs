@@ -9,7 +9,7 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use half::f16;
 
-use crate::attention::head_rows::{Rows, head_of_cube, read_rows};
+use crate::attention::head_rows::{Attention, Rows, head_of_cube, read_rows};
 use crate::attention::matrix_scores::{
     AttentionTile, Scores, Stage, add_products, column_of_unit, fetch_block, load_rows, mask, max_of_row, put_block,
     row_of_unit, scale_sums, sum_of_row, write_scores, write_sums, zero_sums,
@@ -27,16 +27,11 @@ pub(crate) fn forward<F: Float, V: Size>(
     value: &[Vector<F, V>],
     output: &mut [Vector<f32, V>],
     log_sum: &mut [f32],
-    query_rows: Rows,
-    key_rows: Rows,
-    value_rows: Rows,
-    output_rows: Rows,
-    num_heads: usize,
-    scale: f32,
+    at: Attention,
     #[comptime] tile: AttentionTile,
     #[define(F)] _values: ElemType,
 ) {
-    let head = head_of_cube(num_heads, tile.width);
+    let head = head_of_cube(at.num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
     let mut keys = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
     let mut values = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
@@ -47,7 +42,7 @@ pub(crate) fn forward<F: Float, V: Size>(
     let weight_row = row * comptime!(tile.pitches()[1]);
     let fours = comptime!(tile.fours());
 
-    let queries = load_rows::<F, V>(&mut keys, query, &query_rows, &head, first_row, tile);
+    let queries = load_rows::<F, V>(&mut keys, query, &at.query, &head, first_row, tile);
     let mut sums = zero_sums(comptime!(tile.matrices()[1]), tile);
     let mut scaled = Array::<Four<f32>>::new(fours);
     let mut maximum = f32::new(f32::MIN);
@@ -56,25 +51,25 @@ pub(crate) fn forward<F: Float, V: Size>(
 
     let mut next_keys = Array::<Four<f16>>::new(comptime!(tile.fetches()));
     let mut next_values = Array::<Four<f16>>::new(comptime!(tile.fetches()));
-    fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, 0usize, tile);
-    fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_keys, key, &at.key, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_values, value, &at.value, &head, 0usize, tile);
     let mut first = 0usize;
-    while first < key_rows.count {
+    while first < at.key.count {
         sync_cube();
         put_block(&mut keys, &next_keys, tile);
         put_block(&mut values, &next_values, tile);
         sync_cube();
-        fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, first + tile.columns, tile);
-        fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_keys, key, &at.key, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_values, value, &at.value, &head, first + tile.columns, tile);
         write_scores(&mut scores, &queries, &keys, tile);
         let mut largest = f32::new(f32::MIN);
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            scaled[i] = scores[(score_row + column) / 4] * Four::<f32>::new(scale);
+            scaled[i] = scores[(score_row + column) / 4] * Four::<f32>::new(at.scale);
             #[unroll]
             for j in 0..4usize {
-                if first + column + j < key_rows.count {
+                if first + column + j < at.key.count {
                     largest = max(largest, scaled[i].extract(j));
                 }
             }
@@ -91,7 +86,7 @@ pub(crate) fn forward<F: Float, V: Size>(
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            let weight = mask((scaled[i] - Four::<f32>::new(maximum)).exp(), first + column, key_rows.count);
+            let weight = mask((scaled[i] - Four::<f32>::new(maximum)).exp(), first + column, at.key.count);
             total += weight;
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(weight);
         }
@@ -106,9 +101,9 @@ pub(crate) fn forward<F: Float, V: Size>(
         sum += total.extract(j);
     }
     sum = sum_of_row(sum, tile);
-    write_sums::<V>(output, &sums, &mut scores, 1.0 / sum, &output_rows, &head, first_row, tile);
-    if UNIT_POS as usize % comptime!(tile.lanes()) == 0 && first_row + row < query_rows.count {
-        log_sum[CUBE_POS_Y as usize * query_rows.count + first_row + row] = maximum + sum.ln();
+    write_sums::<V>(output, &sums, &mut scores, 1.0 / sum, &at.output, &head, first_row, tile);
+    if UNIT_POS as usize % comptime!(tile.lanes()) == 0 && first_row + row < at.query.count {
+        log_sum[CUBE_POS_Y as usize * at.query.count + first_row + row] = maximum + sum.ln();
     }
 }
 
@@ -122,17 +117,12 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
     log_sum: &[f32],
     delta: &[f32],
     grad_query: &mut [Vector<f32, V>],
-    query_rows: Rows,
-    key_rows: Rows,
-    value_rows: Rows,
-    output_rows: Rows,
+    at: Attention,
     grad_rows: Rows,
-    num_heads: usize,
-    scale: f32,
     #[comptime] tile: AttentionTile,
     #[define(F, G)] _values: [ElemType; 2],
 ) {
-    let head = head_of_cube(num_heads, tile.width);
+    let head = head_of_cube(at.num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
     let mut keys = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
     let mut values = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
@@ -143,44 +133,44 @@ pub(crate) fn backward_by_queries<F: Float, G: Float, V: Size>(
     let weight_row = row * comptime!(tile.pitches()[1]);
     let fours = comptime!(tile.fours());
 
-    let queries = load_rows::<F, V>(&mut keys, query, &query_rows, &head, first_row, tile);
-    let grads = load_rows::<G, V>(&mut keys, grad_output, &output_rows, &head, first_row, tile);
+    let queries = load_rows::<F, V>(&mut keys, query, &at.query, &head, first_row, tile);
+    let grads = load_rows::<G, V>(&mut keys, grad_output, &at.output, &head, first_row, tile);
     let sums = zero_sums(comptime!(tile.matrices()[1]), tile);
     let mut softmax = Array::<Four<f32>>::new(fours);
-    let index = CUBE_POS_Y as usize * query_rows.count + min(first_row + row, query_rows.count - 1);
+    let index = CUBE_POS_Y as usize * at.query.count + min(first_row + row, at.query.count - 1);
     let log = Four::<f32>::new(log_sum[index]);
     let delta = Four::<f32>::new(delta[index]);
 
     let mut next_keys = Array::<Four<f16>>::new(comptime!(tile.fetches()));
     let mut next_values = Array::<Four<f16>>::new(comptime!(tile.fetches()));
-    fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, 0usize, tile);
-    fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_keys, key, &at.key, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_values, value, &at.value, &head, 0usize, tile);
     let mut first = 0usize;
-    while first < key_rows.count {
+    while first < at.key.count {
         sync_cube();
         put_block(&mut keys, &next_keys, tile);
         put_block(&mut values, &next_values, tile);
         sync_cube();
-        fetch_block::<F, V>(&mut next_keys, key, &key_rows, &head, first + tile.columns, tile);
-        fetch_block::<F, V>(&mut next_values, value, &value_rows, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_keys, key, &at.key, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_values, value, &at.value, &head, first + tile.columns, tile);
         write_scores(&mut scores, &queries, &keys, tile);
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            softmax[i] = (scores[(score_row + column) / 4] * Four::<f32>::new(scale) - log).exp();
+            softmax[i] = (scores[(score_row + column) / 4] * Four::<f32>::new(at.scale) - log).exp();
         }
         write_scores(&mut scores, &grads, &values, tile);
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
             let slope = softmax[i] * (scores[(score_row + column) / 4] - delta);
-            weights[(weight_row + column) / 4] = Four::<f16>::cast_from(mask(slope, first + column, key_rows.count));
+            weights[(weight_row + column) / 4] = Four::<f16>::cast_from(mask(slope, first + column, at.key.count));
         }
         sync_plane();
         add_products(&sums, &weights, &keys, tile);
         first += tile.columns;
     }
-    write_sums::<V>(grad_query, &sums, &mut scores, scale, &grad_rows, &head, first_row, tile);
+    write_sums::<V>(grad_query, &sums, &mut scores, at.scale, &grad_rows, &head, first_row, tile);
 }
 
 /// Computes the gradients of keys and values: `dV = P^T dO`, `dK = s dS^T Q`.
@@ -193,18 +183,13 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
     log_sum: &[f32],
     delta: &[f32],
     grad_key_value: &mut [Vector<f32, V>],
-    query_rows: Rows,
-    key_rows: Rows,
-    value_rows: Rows,
-    output_rows: Rows,
+    at: Attention,
     grad_key_rows: Rows,
     grad_value_rows: Rows,
-    num_heads: usize,
-    scale: f32,
     #[comptime] tile: AttentionTile,
     #[define(F, G)] _values: [ElemType; 2],
 ) {
-    let head = head_of_cube(num_heads, tile.width);
+    let head = head_of_cube(at.num_heads, tile.width);
     let first_row = CUBE_POS_X as usize * comptime!(tile.rows());
     let mut queries = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
     let mut grads = Stage::new_slice(comptime!(tile.columns * tile.pitches()[0] / 4));
@@ -215,32 +200,32 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
     let weight_row = row * comptime!(tile.pitches()[1]);
     let fours = comptime!(tile.fours());
 
-    let keys = load_rows::<F, V>(&mut queries, key, &key_rows, &head, first_row, tile);
-    let values = load_rows::<F, V>(&mut queries, value, &value_rows, &head, first_row, tile);
+    let keys = load_rows::<F, V>(&mut queries, key, &at.key, &head, first_row, tile);
+    let values = load_rows::<F, V>(&mut queries, value, &at.value, &head, first_row, tile);
     let key_sums = zero_sums(comptime!(tile.matrices()[1]), tile);
     let value_sums = zero_sums(comptime!(tile.matrices()[1]), tile);
     let mut softmax = Array::<Four<f32>>::new(fours);
-    let start = CUBE_POS_Y as usize * query_rows.count;
+    let start = CUBE_POS_Y as usize * at.query.count;
 
     let mut next_queries = Array::<Four<f16>>::new(comptime!(tile.fetches()));
     let mut next_grads = Array::<Four<f16>>::new(comptime!(tile.fetches()));
-    fetch_block::<F, V>(&mut next_queries, query, &query_rows, &head, 0usize, tile);
-    fetch_block::<G, V>(&mut next_grads, grad_output, &output_rows, &head, 0usize, tile);
+    fetch_block::<F, V>(&mut next_queries, query, &at.query, &head, 0usize, tile);
+    fetch_block::<G, V>(&mut next_grads, grad_output, &at.output, &head, 0usize, tile);
     let mut first = 0usize;
-    while first < query_rows.count {
+    while first < at.query.count {
         sync_cube();
         put_block(&mut queries, &next_queries, tile);
         put_block(&mut grads, &next_grads, tile);
         sync_cube();
-        fetch_block::<F, V>(&mut next_queries, query, &query_rows, &head, first + tile.columns, tile);
-        fetch_block::<G, V>(&mut next_grads, grad_output, &output_rows, &head, first + tile.columns, tile);
+        fetch_block::<F, V>(&mut next_queries, query, &at.query, &head, first + tile.columns, tile);
+        fetch_block::<G, V>(&mut next_grads, grad_output, &at.output, &head, first + tile.columns, tile);
         write_scores(&mut scores, &keys, &queries, tile);
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            let log = read_rows(log_sum, start, first + column, query_rows.count);
-            let weight = (scores[(score_row + column) / 4] * Four::<f32>::new(scale) - log).exp();
-            softmax[i] = mask(weight, first + column, query_rows.count);
+            let log = read_rows(log_sum, start, first + column, at.query.count);
+            let weight = (scores[(score_row + column) / 4] * Four::<f32>::new(at.scale) - log).exp();
+            softmax[i] = mask(weight, first + column, at.query.count);
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(softmax[i]);
         }
         sync_plane();
@@ -249,7 +234,7 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
         #[unroll]
         for i in 0..fours {
             let column = column_of_unit(i, tile);
-            let delta = read_rows(delta, start, first + column, query_rows.count);
+            let delta = read_rows(delta, start, first + column, at.query.count);
             let slope = softmax[i] * (scores[(score_row + column) / 4] - delta);
             weights[(weight_row + column) / 4] = Four::<f16>::cast_from(slope);
         }
@@ -257,6 +242,6 @@ pub(crate) fn backward_by_keys<F: Float, G: Float, V: Size>(
         add_products(&key_sums, &weights, &queries, tile);
         first += tile.columns;
     }
-    write_sums::<V>(grad_key_value, &key_sums, &mut scores, scale, &grad_key_rows, &head, first_row, tile);
+    write_sums::<V>(grad_key_value, &key_sums, &mut scores, at.scale, &grad_key_rows, &head, first_row, tile);
     write_sums::<V>(grad_key_value, &value_sums, &mut scores, 1.0, &grad_value_rows, &head, first_row, tile);
 }

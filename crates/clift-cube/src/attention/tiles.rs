@@ -8,7 +8,7 @@ use crate::buffers::buffer::Values;
 
 /// Returns the tiles of attention of an adapter, forward and backward, with operands of a type; `None` stands for register
 /// tiles.
-pub(crate) fn attention_tiles(client: &Client, operands: Values, width: usize) -> [Option<AttentionTile>; 2] {
+pub fn attention_tiles(client: &Client, operands: Values, width: usize) -> [Option<AttentionTile>; 2] {
     let AdapterClass::Matrices(shape) = AdapterClass::of(client) else { return [None; 2] };
     if operands != Values::F16 {
         return [None; 2];

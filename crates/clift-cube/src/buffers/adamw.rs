@@ -205,7 +205,8 @@ pub fn gradient_norm(client: &Client, grads: &[Buffer]) -> Buffer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{client, random, read, upload, worst};
+    use crate::testing::cases::{Case, random};
+    use crate::testing::{check, client};
 
     #[test]
     fn updates_equal_f64() {
@@ -221,22 +222,24 @@ mod tests {
             grad_factor: 0.5,
         };
         for len in [1, 37, 5000] {
-            let values = [1, 2, 3, 4].map(|seed| random(len, seed));
-            let square: Vec<f32> = values[2].iter().map(|x| x * x).collect();
-            let inputs = [&values[0], &values[1], &square].map(|x| upload(&client, x, Values::F32));
-            let grad = upload(&client, &values[3], Values::F32);
-            let results = adamw(&client, settings, inputs.each_ref(), &grad);
-            let expected = (0..len).map(|i| {
-                let [p, m, s, g] = [values[0][i], values[1][i], square[i], 0.5 * values[3][i]].map(f64::from);
-                let (m, s) = (0.9 * m + 0.1 * g, 0.95 * s + 0.05 * g * g);
-                [p * (1.0 - 1e-2 * 0.05) - 1e-2 * (m / 0.1) / ((s / 0.05).sqrt() + 1e-8), m, s]
+            let inputs = move || {
+                let square = random(len, 3, 1.0).iter().map(|x| x * x).collect();
+                [random(len, 1, 1.0), random(len, 2, 1.0), square, random(len, 4, 1.0)]
+            };
+            let run = move |client: &Client, inputs: &[Buffer]| {
+                adamw(client, settings, [&inputs[0], &inputs[1], &inputs[2]], &inputs[3]).into()
+            };
+            let case = Case::new(inputs, run, move |inputs| {
+                let updated = (0..len).map(|i| {
+                    let [p, m, s, g] = [0, 1, 2, 3].map(|input| inputs[input][i]);
+                    let (m, s) = (0.9 * m + 0.1 * 0.5 * g, 0.95 * s + 0.05 * (0.5 * g).powi(2));
+                    [p * (1.0 - 1e-2 * 0.05) - 1e-2 * (m / 0.1) / ((s / 0.05).sqrt() + 1e-8), m, s]
+                });
+                let updated: Vec<[f64; 3]> = updated.collect();
+                [0, 1, 2].map(|result| updated.iter().map(|values| values[result]).collect()).into()
             });
-            let expected: Vec<[f64; 3]> = expected.collect();
-            for (i, result) in results.iter().enumerate() {
-                let expected: Vec<f64> = expected.iter().map(|values| values[i]).collect();
-                assert!(worst(&read(&client, result), &expected) < 1e-6, "result {i} of {len} values");
-            }
-            assert_eq!(read(&client, &inputs[0]), values[0], "the inputs stay");
+            // Also compares a second run: the inputs stay.
+            check(&client, &case, 1e-6);
         }
     }
 
@@ -244,9 +247,9 @@ mod tests {
     fn the_norm_is_that_of_all_gradients() {
         let Some(client) = client() else { return };
         let lens = [5, 40_000, 37, 8, 12, 400, 16, 70_000, 20, 24, 28, 32];
-        let grads: Vec<Vec<f32>> = lens.iter().enumerate().map(|(seed, &len)| random(len, seed as u64)).collect();
-        let buffers: Vec<Buffer> = grads.iter().map(|x| upload(&client, x, Values::F32)).collect();
-        let norm = grads.iter().flatten().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
-        assert!(worst(&read(&client, &gradient_norm(&client, &buffers)), &[norm]) < 1e-6);
+        let grads = move || lens.map(|len| random(len, len as u64, 1.0));
+        let run = |client: &Client, inputs: &[Buffer]| vec![gradient_norm(client, inputs)];
+        let case = Case::new(grads, run, |grads| vec![vec![grads.iter().flatten().map(|x| x * x).sum::<f64>().sqrt()]]);
+        check(&client, &case, 1e-6);
     }
 }

@@ -13,6 +13,15 @@ pub(crate) struct Lines {
     pub(crate) stride: usize,
 }
 
+/// Lines of an operand that a cube reads, zeros at and after the limit. `start` is the offset of line 0.
+#[derive(CubeType, Clone, Copy)]
+pub(crate) struct Side {
+    pub(crate) start: usize,
+    pub(crate) stride: usize,
+    pub(crate) first: usize,
+    pub(crate) limit: usize,
+}
+
 /// Loads values `inner .. inner + 4` of line `outer`, zeros at and after the limits. `start` is the offset of line 0.
 #[cube]
 pub(crate) fn load_four<E: Numeric, V: Size, S: Float>(

@@ -18,6 +18,13 @@ pub(crate) fn sum_of_row(value: f32, stage: &mut Shared<[f32]>, #[comptime] lane
     sum
 }
 
+/// Returns the row of the unit, of `count` rows, in cubes of some rows of `lanes` units; the last row beyond it.
+#[cube]
+pub(crate) fn row_of_unit(count: usize, #[comptime] rows: usize, #[comptime] lanes: usize) -> usize {
+    let cube = CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize;
+    min(cube * rows + UNIT_POS as usize / lanes, count - 1)
+}
+
 /// Returns the sum of a vector's values.
 #[cube]
 pub(crate) fn sum_of_vector<V: Size>(vector: Vector<f32, V>) -> f32 {

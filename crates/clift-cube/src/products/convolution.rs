@@ -65,34 +65,39 @@ fn im2col<V: Size>(x: &[Vector<f32, V>], output: &mut [Vector<f32, V>], height: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{client, random, read, upload, worst};
+    use crate::testing::cases::{Case, random};
+    use crate::testing::{check, client};
 
     #[test]
     fn convolutions_equal_f64() {
         let Some(client) = client() else { return };
         for [batch, height, width, channels, outputs] in [[1, 1, 1, 3, 5], [2, 5, 7, 3, 8], [1, 6, 4, 8, 70]] {
-            let x = random(batch * height * width * channels, 1);
-            let weight = random(KERNEL_LEN * channels * outputs, 2);
-            let bias = random(outputs, 3);
-            let mut expected = Vec::new();
-            for (image, row, column, output) in (0..batch * height * width * outputs).map(|i| {
-                let pixel = i / outputs;
-                (pixel / (height * width), pixel / width % height, pixel % width, i % outputs)
-            }) {
-                let mut sum = f64::from(bias[output]);
-                for (n, channel) in (0..KERNEL_LEN).flat_map(|n| (0..channels).map(move |channel| (n, channel))) {
-                    let (row, column) = ((row + n / 3).wrapping_sub(1), (column + n % 3).wrapping_sub(1));
-                    if row < height && column < width {
-                        let value = x[((image * height + row) * width + column) * channels + channel];
-                        sum += f64::from(value) * f64::from(weight[(n * channels + channel) * outputs + output]);
-                    }
-                }
-                expected.push(sum);
-            }
-            let [x, weight, bias] = [&x, &weight, &bias].map(|x| upload(&client, x, Values::F32));
-            let weight = Matrices::contiguous(&weight, outputs);
-            let output = convolve(&client, &x, [batch, height, width, channels], weight, outputs, Some(&bias));
-            assert!(worst(&read(&client, &output), &expected) < 1e-5);
+            let lens = [batch * height * width * channels, KERNEL_LEN * channels * outputs, outputs];
+            let run = move |client: &Client, inputs: &[Buffer]| {
+                let weight = Matrices::contiguous(&inputs[1], outputs);
+                vec![convolve(client, &inputs[0], [batch, height, width, channels], weight, outputs, Some(&inputs[2]))]
+            };
+            let case = Case::new(
+                move || lens.map(|len| random(len, len as u64, 1.0)),
+                run,
+                move |inputs| {
+                    let [x, weight, bias] = inputs else { panic!("three inputs") };
+                    let value = |i: usize| {
+                        let (pixel, output) = (i / outputs, i % outputs);
+                        let (image, row, column) = (pixel / (height * width), pixel / width % height, pixel % width);
+                        let terms = (0..KERNEL_LEN * channels).map(|term| {
+                            let (n, channel) = (term / channels, term % channels);
+                            let (row, column) = ((row + n / 3).wrapping_sub(1), (column + n % 3).wrapping_sub(1));
+                            let is_inside = row < height && column < width;
+                            let value = || x[((image * height + row) * width + column) * channels + channel];
+                            if is_inside { value() * weight[term * outputs + output] } else { 0.0 }
+                        });
+                        bias[output] + terms.sum::<f64>()
+                    };
+                    vec![(0..batch * height * width * outputs).map(value).collect()]
+                },
+            );
+            check(&client, &case, 1e-5);
         }
     }
 }

@@ -8,9 +8,9 @@ use cubecl::prelude::*;
 use half::f16;
 
 use crate::adapter::MatrixShape;
-use crate::buffers::load::{Four, Lines, load_four};
+use crate::buffers::load::{Four, Lines, Side, load_four};
 use crate::products::epilogue::write_four;
-use crate::products::product_kind::{ProductKind, Sizes};
+use crate::products::product_kind::{ProductKind, Sizes, cube_tile};
 
 /// Padding of the lines of a stage, in values, so that lines begin in different banks.
 pub(crate) const PAD: usize = 8;
@@ -86,11 +86,8 @@ impl StagePart {
 fn fetch<E: Numeric, V: Size>(
     to: &mut Array<Four<f16>>,
     from: &[Vector<E, V>],
-    start: usize,
-    stride: usize,
-    first_side: usize,
+    side: &Side,
     first_term: usize,
-    side_limit: usize,
     term_limit: usize,
     #[comptime] part: StagePart,
 ) {
@@ -98,16 +95,16 @@ fn fetch<E: Numeric, V: Size>(
     #[unroll]
     for step in 0..blocks.div_ceil(part.units) {
         let index = UNIT_POS as usize + step * part.units;
-        let side = first_side + index / (part.terms / 4) * block;
+        let line = side.first + index / (part.terms / 4) * block;
         let term = first_term + index % (part.terms / 4) * 4;
         #[unroll]
         for j in 0..block {
             let mut four = Four::<f16>::new(f16::new(0.0));
             if comptime!(blocks.is_multiple_of(part.units)) || index < blocks {
                 four = if comptime!(part.terms_inner) {
-                    load_four::<E, V, f16>(from, start, stride, side, term, side_limit, term_limit)
+                    load_four::<E, V, f16>(from, side.start, side.stride, line, term, side.limit, term_limit)
                 } else {
-                    load_four::<E, V, f16>(from, start, stride, term + j, side, term_limit, side_limit)
+                    load_four::<E, V, f16>(from, side.start, side.stride, term + j, line, term_limit, side.limit)
                 };
             }
             to[step * block + j] = four;
@@ -130,30 +127,16 @@ fn put(stage: &mut [Four<f16>], from: &Array<Four<f16>>, first: usize, #[comptim
             } else {
                 #[unroll]
                 for i in 0..4usize {
-                    let row = step * 4;
-                    let four = column_of_block(from[row], from[row + 1], from[row + 2], from[row + 3], i);
+                    let mut four = Four::<f16>::new(f16::new(0.0));
+                    #[unroll]
+                    for j in 0..4usize {
+                        four.insert(j, from[step * 4 + j].extract(i));
+                    }
                     stage[first + (side + i) * part.pitch() + term] = four;
                 }
             }
         }
     }
-}
-
-/// Returns a column of four rows.
-#[cube]
-fn column_of_block(
-    first: Four<f16>,
-    second: Four<f16>,
-    third: Four<f16>,
-    fourth: Four<f16>,
-    #[comptime] column: usize,
-) -> Four<f16> {
-    let mut values = Four::<f16>::new(f16::new(0.0));
-    values.insert(0usize, first.extract(column));
-    values.insert(1usize, second.extract(column));
-    values.insert(2usize, third.extract(column));
-    values.insert(3usize, fourth.extract(column));
-    values
 }
 
 /// Operand of a product of matrices in a stage.
@@ -217,17 +200,9 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
     let rows = comptime!(tile.matrices()[0]);
     let columns = comptime!(tile.matrices()[1]);
 
-    let batch = CUBE_POS_Z as usize / sizes.splits;
-    let split = CUBE_POS_Z as usize % sizes.splits;
-    let first_row = CUBE_POS_Y as usize * m;
-    let first_column = CUBE_POS_X as usize * n;
-    let first_term = split * sizes.split_terms;
-    let last_term = min(first_term + sizes.split_terms, sizes.terms);
-    let lhs_start = lhs_lines.start + batch * lhs_lines.batch_stride;
-    let rhs_start = rhs_lines.start + batch * rhs_lines.batch_stride;
-
-    let lhs_part = comptime!(StagePart { terms_inner: kind.lhs.terms_inner, sides: m, terms: k, units });
-    let rhs_part = comptime!(StagePart { terms_inner: kind.rhs.terms_inner, sides: n, terms: k, units });
+    let at = cube_tile(&lhs_lines, &rhs_lines, &sizes, m, n);
+    let lhs_part = comptime!(StagePart { terms_inner: kind.terms_inner[0], sides: m, terms: k, units });
+    let rhs_part = comptime!(StagePart { terms_inner: kind.terms_inner[1], sides: n, terms: k, units });
     let mut lhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(tile.buffers * lhs_part.len()));
     let mut rhs_stage = Shared::<[Four<f16>]>::new_slice(comptime!(tile.buffers * rhs_part.len()));
     let lhs_staged =
@@ -248,12 +223,11 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
         sums.push(Matrix::<f32>::from_value(MatrixIdent::Accumulator, sm, sn, sk, MatrixLayout::Undefined, 0.0));
     }
 
-    let mut term = first_term;
+    let mut term = at.first_term;
     let mut buffer = 0usize;
-    let (lhs_stride, rhs_stride) = (lhs_lines.stride, rhs_lines.stride);
-    fetch::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_stride, first_row, term, sizes.rows, last_term, lhs_part);
-    fetch::<B, VB>(&mut rhs_next, rhs, rhs_start, rhs_stride, first_column, term, sizes.columns, last_term, rhs_part);
-    while term < last_term {
+    fetch::<A, VA>(&mut lhs_next, lhs, &at.lhs, term, at.last_term, lhs_part);
+    fetch::<B, VB>(&mut rhs_next, rhs, &at.rhs, term, at.last_term, rhs_part);
+    while term < at.last_term {
         if comptime!(tile.buffers == 1) {
             sync_cube();
         }
@@ -265,18 +239,8 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
         let rhs_now = &rhs_stage[rhs_first..rhs_stage.len()];
         buffer = (buffer + 1) % tile.buffers;
         term += k;
-        fetch::<A, VA>(&mut lhs_next, lhs, lhs_start, lhs_stride, first_row, term, sizes.rows, last_term, lhs_part);
-        fetch::<B, VB>(
-            &mut rhs_next,
-            rhs,
-            rhs_start,
-            rhs_stride,
-            first_column,
-            term,
-            sizes.columns,
-            last_term,
-            rhs_part,
-        );
+        fetch::<A, VA>(&mut lhs_next, lhs, &at.lhs, term, at.last_term, lhs_part);
+        fetch::<B, VB>(&mut rhs_next, rhs, &at.rhs, term, at.last_term, rhs_part);
         #[unroll]
         for t in 0..comptime!(k / sk) {
             let mut b = Sequence::<Matrix<f16>>::new();
@@ -314,8 +278,8 @@ pub(crate) fn matrix_product<A: Float, B: Float, O: Float, VA: Size, VB: Size, V
             #[unroll]
             for step in 0..comptime!((sm * sn / 4).div_ceil(plane_units)) {
                 let four = lane + step * plane_units;
-                let row = first_row + plane_row + i * sm + four / (sn / 4);
-                let column = first_column + plane_column + j * sn + four % (sn / 4) * 4;
+                let row = at.lhs.first + plane_row + i * sm + four / (sn / 4);
+                let column = at.rhs.first + plane_column + j * sn + four % (sn / 4) * 4;
                 write_four::<O, VO>(
                     output,
                     bias,

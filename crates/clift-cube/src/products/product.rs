@@ -8,7 +8,7 @@ use crate::buffers::buffer::{Buffer, Matrices, Values};
 use crate::buffers::load::{Four, LinesLaunch};
 use crate::products::epilogue::{Epilogue, write_four};
 use crate::products::matrix_product::matrix_product;
-use crate::products::product_kind::{OperandKind, ProductKind, SizesLaunch};
+use crate::products::product_kind::{ProductKind, SizesLaunch};
 use crate::products::register_product::register_product;
 use crate::products::tiles::{ProductTile, product_tile};
 
@@ -87,11 +87,7 @@ impl<'a> Product<'a> {
 
     fn launch(&self, client: &Client, tile: ProductTile, splits: Splits, epilogue: Epilogue, output: &Buffer) {
         let [m, n, k] = self.sizes;
-        let kind = ProductKind {
-            lhs: OperandKind { terms_inner: !self.lhs.transposed },
-            rhs: OperandKind { terms_inner: self.rhs.transposed },
-            epilogue,
-        };
+        let kind = ProductKind { terms_inner: [!self.lhs.transposed, self.rhs.transposed], epilogue };
         let [lhs_width, rhs_width] = [self.lhs.width([m, k]), self.rhs.width([k, n])];
         let output_width = if n.is_multiple_of(4) { 4 } else { 1 };
         let lines = |x: &Matrices| LinesLaunch::new(x.start, x.batch_stride, x.stride);
@@ -194,4 +190,59 @@ fn add_splits<O: Float, V: Size>(
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+    use crate::products::matrix_product::MatrixTile;
+    use crate::products::register_product::RegisterTile;
+    use crate::testing::cases::product;
+    use crate::testing::{check, client, matrix_client};
+
+    /// Checks a product with every step.
+    fn check_product(
+        client: &Client,
+        tile: ProductTile,
+        sizes: [usize; 3],
+        batch: usize,
+        transposed: [bool; 2],
+        types: [Values; 3],
+    ) {
+        let tolerance = if types[2] == Values::F16 { 6e-4 } else { 3e-7 * (sizes[2] as f64).sqrt().max(8.0) };
+        check(client, &product(tile, sizes, batch, transposed, types, false), tolerance);
+    }
+
+    const BOTH: [[bool; 2]; 4] = [[false, false], [true, false], [false, true], [true, true]];
+
+    #[test]
+    fn register_tiles_equal_f64() {
+        let Some(client) = client() else { return };
+        let small = ProductTile::Register(RegisterTile { stage: [64, 64, 16], unit: [4, 4] });
+        let large = ProductTile::Register(RegisterTile { stage: [128, 128, 16], unit: [8, 8] });
+        let f32 = [Values::F32; 3];
+        for transposed in BOTH {
+            check_product(&client, small, [65, 68, 36], 2, transposed, f32);
+            check_product(&client, small, [3, 7, 1], 1, transposed, f32);
+        }
+        check_product(&client, large, [130, 129, 40], 1, [false, true], f32);
+        // Few tiles and long sums: splits.
+        check_product(&client, small, [12, 70, 1030], 2, [true, false], f32);
+        check_product(&client, small, [20, 24, 33], 1, [false, false], [Values::F16, Values::F32, Values::F16]);
+    }
+
+    #[test]
+    fn matrix_tiles_equal_f64_of_rounded_operands() {
+        let Some((client, shape)) = matrix_client() else { return };
+        let tile = |buffers| {
+            let [m, n, k] = shape.sizes;
+            ProductTile::Matrix(MatrixTile { shape, stage: [2 * m, 4 * n, 2 * k], planes: [2, 2], buffers })
+        };
+        let small = tile(2);
+        for transposed in BOTH {
+            check_product(&client, tile(1), [65, 68, 36], 2, transposed, [Values::F32; 3]);
+            check_product(&client, small, [3, 7, 1], 1, transposed, [Values::F16, Values::F32, Values::F32]);
+            check_product(&client, small, [24, 40, 64], 1, transposed, [Values::F16; 3]);
+        }
+        check_product(&client, small, [12, 70, 1030], 2, [true, false], [Values::F32; 3]);
+        let table = product_tile(&client, Values::F16, 1, [256, 256, 64], [true, false]);
+        check_product(&client, table, [96, 100, 72], 1, [false, true], [Values::F32, Values::F16, Values::F16]);
+    }
+}

@@ -4,9 +4,9 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
-use crate::buffers::load::{Four, Lines, load_four};
+use crate::buffers::load::{Four, Lines, Side, load_four};
 use crate::products::epilogue::write_four;
-use crate::products::product_kind::{ProductKind, Sizes};
+use crate::products::product_kind::{ProductKind, Sizes, cube_tile};
 
 /// Tile of a cube and of a unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -29,67 +29,81 @@ impl RegisterTile {
     }
 }
 
-/// Reads an operand's part of a stage into registers. A group is four values along the side (M or N), or, where the terms
-/// lie side by side, a block of four by four values.
+/// An operand's part of a stage, `[terms][side]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct StagePart {
+    /// The terms lie side by side in the buffer.
+    pub(crate) terms_inner: bool,
+    pub(crate) side: usize,
+    pub(crate) terms: usize,
+    pub(crate) units: usize,
+}
+
+impl StagePart {
+    /// Vectors that a unit copies at once: one along the side (M or N), or a block of 4 x 4 values that it transposes.
+    fn block(self) -> usize {
+        if self.terms_inner { 4 } else { 1 }
+    }
+
+    fn blocks(self) -> usize {
+        self.side * self.terms / 4 / self.block()
+    }
+
+    /// Vectors of a unit.
+    pub(crate) fn fetches(self) -> usize {
+        self.blocks().div_ceil(self.units) * self.block()
+    }
+
+    /// Vectors between two terms.
+    pub(crate) fn pitch(self) -> usize {
+        self.side / 4 + 1
+    }
+}
+
+/// Reads an operand's part of a stage into registers.
 #[cube]
 pub(crate) fn fetch<E: Numeric, V: Size>(
     to: &mut Array<Four<f32>>,
     from: &[Vector<E, V>],
-    start: usize,
-    stride: usize,
-    side: usize,
-    term: usize,
-    side_limit: usize,
+    side: &Side,
+    first_term: usize,
     term_limit: usize,
-    #[comptime] terms_inner: bool,
-    #[comptime] stage_side: usize,
-    #[comptime] stage_terms: usize,
-    #[comptime] units: usize,
+    #[comptime] part: StagePart,
 ) {
-    let block = comptime!(if terms_inner { 4 } else { 1 });
-    let groups = comptime!(stage_side * stage_terms / 4 / block);
+    let (blocks, block) = comptime!((part.blocks(), part.block()));
     #[unroll]
-    for step in 0..groups.div_ceil(units) {
-        let group = UNIT_POS as usize + step * units;
+    for step in 0..blocks.div_ceil(part.units) {
+        let index = UNIT_POS as usize + step * part.units;
         #[unroll]
         for j in 0..block {
             let mut values = Four::<f32>::new(0.0);
-            if comptime!(groups.is_multiple_of(units)) || group < groups {
-                if comptime!(terms_inner) {
-                    let side = side + group / (stage_terms / 4) * 4 + j;
-                    let term = term + group % (stage_terms / 4) * 4;
-                    values = load_four::<E, V, f32>(from, start, stride, side, term, side_limit, term_limit);
+            if comptime!(blocks.is_multiple_of(part.units)) || index < blocks {
+                values = if comptime!(part.terms_inner) {
+                    let line = side.first + index / (part.terms / 4) * 4 + j;
+                    let term = first_term + index % (part.terms / 4) * 4;
+                    load_four::<E, V, f32>(from, side.start, side.stride, line, term, side.limit, term_limit)
                 } else {
-                    let side = side + group % (stage_side / 4) * 4;
-                    let term = term + group / (stage_side / 4);
-                    values = load_four::<E, V, f32>(from, start, stride, term, side, term_limit, side_limit);
-                }
+                    let first = side.first + index % (part.side / 4) * 4;
+                    let term = first_term + index / (part.side / 4);
+                    load_four::<E, V, f32>(from, side.start, side.stride, term, first, term_limit, side.limit)
+                };
             }
             to[step * block + j] = values;
         }
     }
 }
 
-/// Writes the values that [`fetch`] read into a stage `[terms][side]`.
+/// Writes the values that [`fetch`] read into a stage.
 #[cube]
-pub(crate) fn put(
-    stage: &mut [Four<f32>],
-    from: &Array<Four<f32>>,
-    #[comptime] terms_inner: bool,
-    #[comptime] stage_side: usize,
-    #[comptime] stage_terms: usize,
-    #[comptime] units: usize,
-) {
-    let block = comptime!(if terms_inner { 4 } else { 1 });
-    let groups = comptime!(stage_side * stage_terms / 4 / block);
-    let pitch = comptime!(stage_side / 4 + 1);
+pub(crate) fn put(stage: &mut [Four<f32>], from: &Array<Four<f32>>, #[comptime] part: StagePart) {
+    let blocks = comptime!(part.blocks());
     #[unroll]
-    for step in 0..groups.div_ceil(units) {
-        let group = UNIT_POS as usize + step * units;
-        if comptime!(groups.is_multiple_of(units)) || group < groups {
-            if comptime!(terms_inner) {
-                let column = group / (stage_terms / 4);
-                let term = group % (stage_terms / 4) * 4;
+    for step in 0..blocks.div_ceil(part.units) {
+        let index = UNIT_POS as usize + step * part.units;
+        if comptime!(blocks.is_multiple_of(part.units)) || index < blocks {
+            if comptime!(part.terms_inner) {
+                let column = index / (part.terms / 4);
+                let term = index % (part.terms / 4) * 4;
                 #[unroll]
                 for k in 0..4usize {
                     let mut values = Four::<f32>::new(0.0);
@@ -97,10 +111,10 @@ pub(crate) fn put(
                     for j in 0..4usize {
                         values.insert(j, from[step * 4 + j].extract(k));
                     }
-                    stage[(term + k) * pitch + column] = values;
+                    stage[(term + k) * part.pitch() + column] = values;
                 }
             } else {
-                stage[group / (stage_side / 4) * pitch + group % (stage_side / 4)] = from[step];
+                stage[index / (part.side / 4) * part.pitch() + index % (part.side / 4)] = from[step];
             }
         }
     }
@@ -130,23 +144,13 @@ pub(crate) fn register_product<A: Float, B: Float, O: Float, VA: Size, VB: Size,
     let rows = comptime!(tile.unit[0]);
     let columns = comptime!(tile.unit[1]);
 
-    let batch = CUBE_POS_Z as usize / sizes.splits;
-    let split = CUBE_POS_Z as usize % sizes.splits;
-    let first_row = CUBE_POS_Y as usize * m;
-    let first_column = CUBE_POS_X as usize * n;
-    let first_term = split * sizes.split_terms;
-    let last_term = min(first_term + sizes.split_terms, sizes.terms);
-    let lhs_start = lhs_lines.start + batch * lhs_lines.batch_stride;
-    let rhs_start = rhs_lines.start + batch * rhs_lines.batch_stride;
-
-    let mut lhs_stage = Shared::<[Four<f32>]>::new_slice(comptime!(k * (m / 4 + 1)));
-    let mut rhs_stage = Shared::<[Four<f32>]>::new_slice(comptime!(k * (n / 4 + 1)));
-    let lhs_fetch = comptime!(kind.lhs.fetches(m, k, units));
-    let rhs_fetch = comptime!(kind.rhs.fetches(n, k, units));
-    let mut lhs_next = Array::<Four<f32>>::new(lhs_fetch);
-    let mut rhs_next = Array::<Four<f32>>::new(rhs_fetch);
-    let lhs_inner = comptime!(kind.lhs.terms_inner);
-    let rhs_inner = comptime!(kind.rhs.terms_inner);
+    let at = cube_tile(&lhs_lines, &rhs_lines, &sizes, m, n);
+    let lhs_part = comptime!(StagePart { terms_inner: kind.terms_inner[0], side: m, terms: k, units });
+    let rhs_part = comptime!(StagePart { terms_inner: kind.terms_inner[1], side: n, terms: k, units });
+    let mut lhs_stage = Shared::<[Four<f32>]>::new_slice(comptime!(k * lhs_part.pitch()));
+    let mut rhs_stage = Shared::<[Four<f32>]>::new_slice(comptime!(k * rhs_part.pitch()));
+    let mut lhs_next = Array::<Four<f32>>::new(comptime!(lhs_part.fetches()));
+    let mut rhs_next = Array::<Four<f32>>::new(comptime!(rhs_part.fetches()));
 
     let x = UNIT_POS as usize % units_x;
     let y = UNIT_POS as usize / units_x;
@@ -159,77 +163,25 @@ pub(crate) fn register_product<A: Float, B: Float, O: Float, VA: Size, VB: Size,
     let mut a = Array::<Four<f32>>::new(comptime!(rows / 4));
     let mut b = Array::<Four<f32>>::new(comptime!(columns / 4));
 
-    fetch::<A, VA>(
-        &mut lhs_next,
-        lhs,
-        lhs_start,
-        lhs_lines.stride,
-        first_row,
-        first_term,
-        sizes.rows,
-        last_term,
-        lhs_inner,
-        m,
-        k,
-        units,
-    );
-    fetch::<B, VB>(
-        &mut rhs_next,
-        rhs,
-        rhs_start,
-        rhs_lines.stride,
-        first_column,
-        first_term,
-        sizes.columns,
-        last_term,
-        rhs_inner,
-        n,
-        k,
-        units,
-    );
-    let mut term = first_term;
-    while term < last_term {
+    let mut term = at.first_term;
+    fetch::<A, VA>(&mut lhs_next, lhs, &at.lhs, term, at.last_term, lhs_part);
+    fetch::<B, VB>(&mut rhs_next, rhs, &at.rhs, term, at.last_term, rhs_part);
+    while term < at.last_term {
         sync_cube();
-        put(&mut lhs_stage, &lhs_next, lhs_inner, m, k, units);
-        put(&mut rhs_stage, &rhs_next, rhs_inner, n, k, units);
+        put(&mut lhs_stage, &lhs_next, lhs_part);
+        put(&mut rhs_stage, &rhs_next, rhs_part);
         sync_cube();
         term += k;
-        fetch::<A, VA>(
-            &mut lhs_next,
-            lhs,
-            lhs_start,
-            lhs_lines.stride,
-            first_row,
-            term,
-            sizes.rows,
-            last_term,
-            lhs_inner,
-            m,
-            k,
-            units,
-        );
-        fetch::<B, VB>(
-            &mut rhs_next,
-            rhs,
-            rhs_start,
-            rhs_lines.stride,
-            first_column,
-            term,
-            sizes.columns,
-            last_term,
-            rhs_inner,
-            n,
-            k,
-            units,
-        );
+        fetch::<A, VA>(&mut lhs_next, lhs, &at.lhs, term, at.last_term, lhs_part);
+        fetch::<B, VB>(&mut rhs_next, rhs, &at.rhs, term, at.last_term, rhs_part);
         for t in 0..k {
             #[unroll]
             for i in 0..rows / 4 {
-                a[i] = lhs_stage[t * (m / 4 + 1) + y + i * units_y];
+                a[i] = lhs_stage[t * comptime!(lhs_part.pitch()) + y + i * units_y];
             }
             #[unroll]
             for i in 0..columns / 4 {
-                b[i] = rhs_stage[t * (n / 4 + 1) + x + i * units_x];
+                b[i] = rhs_stage[t * comptime!(rhs_part.pitch()) + x + i * units_x];
             }
             #[unroll]
             for i in 0..rows {
@@ -245,10 +197,10 @@ pub(crate) fn register_product<A: Float, B: Float, O: Float, VA: Size, VB: Size,
     let start = CUBE_POS_Z as usize * sizes.rows * sizes.columns;
     #[unroll]
     for i in 0..rows {
-        let row = first_row + (y + i / 4 * units_y) * 4 + i % 4;
+        let row = at.lhs.first + (y + i / 4 * units_y) * 4 + i % 4;
         #[unroll]
         for j in 0..columns / 4 {
-            let column = first_column + (x + j * units_x) * 4;
+            let column = at.rhs.first + (x + j * units_x) * 4;
             let sum = sums[i * (columns / 4) + j];
             write_four::<O, VO>(
                 output,

@@ -117,21 +117,16 @@ pub fn gelu_backward(client: &Client, x: &Buffer, grad: &Buffer) -> Buffer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{client, erfc, read, upload, worst};
+    use crate::testing::row_cases::gelu;
+    use crate::testing::{check, client};
 
     #[test]
     fn gelu_and_its_gradient_equal_f64() {
         let Some(client) = client() else { return };
-        let x: Vec<f32> = (-60..=60).map(|i| i as f32 / 8.0).collect();
-        let grad: Vec<f32> = x.iter().map(|x| 1.5 - x / 10.0).collect();
-        let [x_, grad_] = [&x, &grad].map(|x| upload(&client, x, Values::F32));
-        let normal = |x: f64| 0.5 * erfc(-x * std::f64::consts::FRAC_1_SQRT_2);
-        let density = |x: f64| (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();
-        let values = x.iter().zip(&grad).map(|(&x, &grad)| (f64::from(x), f64::from(grad)));
-        let (expected, slopes): (Vec<f64>, Vec<f64>) =
-            values.map(|(x, grad)| (x * normal(x), grad * (normal(x) + x * density(x)))).unzip();
-        assert!(worst(&read(&client, &gelu_forward(&client, &x_, Values::F32)), &expected) < 1e-6);
-        assert!(worst(&read(&client, &gelu_forward(&client, &x_, Values::F16)), &expected) < 6e-4);
-        assert!(worst(&read(&client, &gelu_backward(&client, &x_, &grad_)), &slopes) < 1e-6);
+        for (output, tolerance) in [(Some(Values::F32), 1e-6), (Some(Values::F16), 6e-4), (None, 1e-6)] {
+            for len in [121, 1000] {
+                check(&client, &gelu(len, output), tolerance);
+            }
+        }
     }
 }

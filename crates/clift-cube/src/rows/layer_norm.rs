@@ -5,7 +5,7 @@ use cubecl::prelude::*;
 
 use crate::buffers::buffer::{Buffer, Values};
 use crate::buffers::elementwise::cube_count;
-use crate::buffers::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
+use crate::buffers::reduce::{RowSizes, Term, row_of_unit, sum_of_row, sum_of_vector, sum_over_rows};
 
 /// Units of a row, and rows of a cube.
 const LANES: usize = 32;
@@ -27,11 +27,7 @@ fn forward<O: Float, V: Size>(
     let mut stage = Shared::<[f32]>::new_slice(ROWS * LANES);
     let vectors = columns / V::value().comptime();
     let lane = UNIT_POS as usize % LANES;
-    // Units beyond the last row compute that row too.
-    let row = min(
-        (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * ROWS + UNIT_POS as usize / LANES,
-        rows - 1,
-    );
+    let row = row_of_unit(rows, ROWS, LANES);
     let start = row * vectors;
 
     let mut sum = Vector::<f32, V>::new(0.0);
@@ -76,10 +72,7 @@ fn backward<V: Size>(
     let mut stage = Shared::<[f32]>::new_slice(ROWS * LANES);
     let vectors = columns / V::value().comptime();
     let lane = UNIT_POS as usize % LANES;
-    let row = min(
-        (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * ROWS + UNIT_POS as usize / LANES,
-        rows - 1,
-    );
+    let row = row_of_unit(rows, ROWS, LANES);
     let start = row * vectors;
     let mean = Vector::<f32, V>::new(statistics[row * 2]);
     let inverse = Vector::<f32, V>::new(statistics[row * 2 + 1]);
@@ -172,46 +165,17 @@ pub fn layer_norm_backward(client: &Client, [x, gamma, statistics]: [&Buffer; 3]
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::buffers::reduce::sum_rows;
-    use crate::testing::{client, random, read, upload, worst};
+    use crate::testing::row_cases::{layer_norm, row_sums};
+    use crate::testing::{check, client};
 
     #[test]
     fn norms_and_their_gradients_equal_f64() {
         let Some(client) = client() else { return };
         for (rows, columns) in [(1, 4), (70, 37), (9, 768)] {
-            let [x, gamma, beta, grad] = [(rows * columns, 1), (columns, 2), (columns, 3), (rows * columns, 4)]
-                .map(|(len, seed)| random(len, seed));
-            let [x_, gamma_, beta_, grad_] = [&x, &gamma, &beta, &grad].map(|x| upload(&client, x, Values::F32));
-            let [output, statistics] = layer_norm_forward(&client, [&x_, &gamma_, &beta_], 1e-5, Values::F32);
-            let [grad_x, grad_gamma, grad_beta] = layer_norm_backward(&client, [&x_, &gamma_, &statistics], &grad_);
-
-            let [mut expected, mut expected_x] = [Vec::new(), Vec::new()];
-            let mut expected_sums = vec![0.0; 2 * columns];
-            let n = columns as f64;
-            for row in 0..rows {
-                let line =
-                    |x: &[f32]| -> Vec<f64> { x[row * columns..][..columns].iter().map(|&x| f64::from(x)).collect() };
-                let (x, grad) = (line(&x), line(&grad));
-                let mean = x.iter().sum::<f64>() / n;
-                let inverse = 1.0 / (x.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n + 1e-5).sqrt();
-                let y: Vec<f64> = x.iter().map(|x| (x - mean) * inverse).collect();
-                let slope: Vec<f64> = (0..columns).map(|i| grad[i] * f64::from(gamma[i])).collect();
-                let along = (0..columns).map(|i| slope[i] * y[i]).sum::<f64>() / n;
-                let center = slope.iter().sum::<f64>() / n;
-                for i in 0..columns {
-                    expected.push(y[i] * f64::from(gamma[i]) + f64::from(beta[i]));
-                    expected_x.push((slope[i] - center - y[i] * along) * inverse);
-                    expected_sums[i] += grad[i] * y[i];
-                    expected_sums[columns + i] += grad[i];
-                }
+            for (output, tolerance) in [(Some(Values::F32), 3e-6), (Some(Values::F16), 6e-4), (None, 3e-6)] {
+                check(&client, &layer_norm(rows, columns, output), tolerance);
             }
-            assert!(worst(&read(&client, &output), &expected) < 3e-6);
-            assert!(worst(&read(&client, &grad_x), &expected_x) < 3e-6);
-            assert!(worst(&read(&client, &grad_gamma), &expected_sums[..columns]) < 3e-6);
-            assert!(worst(&read(&client, &grad_beta), &expected_sums[columns..]) < 3e-6);
-            assert!(worst(&read(&client, &sum_rows(&client, &grad_, columns)), &expected_sums[columns..]) < 3e-6);
-            let [output, _] = layer_norm_forward(&client, [&x_, &gamma_, &beta_], 1e-5, Values::F16);
-            assert!(worst(&read(&client, &output), &expected) < 6e-4);
+            check(&client, &row_sums(rows, columns), 3e-6);
         }
     }
 }

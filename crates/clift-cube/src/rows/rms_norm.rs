@@ -4,7 +4,7 @@ use cubecl::prelude::*;
 
 use crate::buffers::buffer::{Buffer, Values};
 use crate::buffers::elementwise::cube_count;
-use crate::buffers::reduce::{RowSizes, Term, sum_of_row, sum_of_vector, sum_over_rows};
+use crate::buffers::reduce::{RowSizes, Term, row_of_unit, sum_of_row, sum_of_vector, sum_over_rows};
 
 /// Units of a head, and heads of a cube.
 const LANES: usize = 8;
@@ -43,9 +43,7 @@ fn norm<V: Size>(
     let vector = V::value().comptime();
     let vectors = comptime!(width / vector);
     let lane = UNIT_POS as usize % LANES;
-    let all_heads = rows * num_parts * num_heads;
-    let index = (CUBE_POS_Y as usize * CUBE_COUNT_X as usize + CUBE_POS_X as usize) * HEADS + UNIT_POS as usize / LANES;
-    let head = min(index, all_heads - 1);
+    let head = row_of_unit(rows * num_parts * num_heads, HEADS, LANES);
     let part = head / num_heads % num_parts;
     let has_norm = part < norm_parts;
     let start = head * vectors;
@@ -139,45 +137,16 @@ pub fn rms_norm_backward(client: &Client, [x, gammas]: [&Buffer; 2], grad: &Buff
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::testing::{client, random, read, upload, worst};
+    use crate::testing::row_cases::rms_norm;
+    use crate::testing::{check, client};
 
     #[test]
     fn norms_of_heads_and_their_gradients_equal_f64() {
         let Some(client) = client() else { return };
         for (rows, num_heads, width, norm_parts) in [(70, 2, 12, 2), (3, 1, 96, 1), (5, 3, 37, 3)] {
-            let parts = 3;
-            let len = rows * parts * num_heads * width;
-            let [x, gammas, grad] = [(len, 1), (norm_parts * width, 2), (len, 3)].map(|(len, seed)| random(len, seed));
-            let [x_, gammas_, grad_] = [&x, &gammas, &grad].map(|x| upload(&client, x, Values::F32));
-            let heads = NormHeads { num_parts: parts, num_heads, head_width: width, epsilon: 1e-5 };
-            let output = rms_norm_forward(&client, [&x_, &gammas_], heads);
-            let [grad_x, grad_gammas] = rms_norm_backward(&client, [&x_, &gammas_], &grad_, heads);
-
-            let [mut expected, mut expected_x] = [Vec::new(), Vec::new()];
-            let mut expected_gammas = vec![0.0; norm_parts * width];
-            for head in 0..rows * parts * num_heads {
-                let part = head / num_heads % parts;
-                let line =
-                    |x: &[f32]| -> Vec<f64> { x[head * width..][..width].iter().map(|&x| f64::from(x)).collect() };
-                let (x, grad) = (line(&x), line(&grad));
-                if part >= norm_parts {
-                    expected.extend(x);
-                    expected_x.extend(grad);
-                    continue;
-                }
-                let gamma = |i: usize| f64::from(gammas[part * width + i]);
-                let inverse = 1.0 / (x.iter().map(|x| x * x).sum::<f64>() / width as f64 + 1e-5).sqrt();
-                let along = (0..width).map(|i| grad[i] * gamma(i) * x[i] * inverse).sum::<f64>() / width as f64;
-                for i in 0..width {
-                    expected.push(x[i] * inverse * gamma(i));
-                    expected_x.push((grad[i] * gamma(i) - x[i] * inverse * along) * inverse);
-                    expected_gammas[part * width + i] += grad[i] * x[i] * inverse;
-                }
+            for is_backward in [false, true] {
+                check(&client, &rms_norm(rows, [num_heads, width], norm_parts, is_backward), 3e-6);
             }
-            assert!(worst(&read(&client, &output), &expected) < 3e-6);
-            assert!(worst(&read(&client, &grad_x), &expected_x) < 3e-6);
-            assert!(worst(&read(&client, &grad_gammas), &expected_gammas) < 3e-6);
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::io::Read;
 use std::path::Path;
 
-use serde::de::DeserializeOwned;
+use serde::Deserialize;
 
 use crate::error::DataError;
 
@@ -33,7 +33,7 @@ pub(crate) fn read_start(path: &Path, limit: u64) -> Option<Vec<u8>> {
 }
 
 /// Parses JSON. A byte order mark in front, which editors on Windows write, is skipped.
-pub(crate) fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, serde_json::Error> {
+pub(crate) fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, serde_json::Error> {
     serde_json::from_slice(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 

@@ -1,11 +1,10 @@
 //! File names of a folder, and their natural order.
 
-use std::borrow::Cow;
 use std::cmp::Ordering;
 use std::ffi::OsString;
 use std::path::Path;
 
-use unicode_normalization::{UnicodeNormalization, is_nfc};
+use unicode_normalization::UnicodeNormalization;
 
 use crate::error::DataError;
 
@@ -22,9 +21,7 @@ pub(crate) fn raw_file_names(folder: &Path) -> Result<Vec<OsString>, DataError> 
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(DataError::io("listing the folder", folder))? {
         let name = entry.map_err(DataError::io("listing the folder", folder))?.file_name();
-        if !name.as_encoded_bytes().starts_with(b".") {
-            names.push(name);
-        }
+        names.extend(Some(name).filter(|name| !name.as_encoded_bytes().starts_with(b".")));
         if names.len() > MAX_ENTRIES {
             let what = format!("the folder has more than {MAX_ENTRIES} entries");
             return Err(DataError::UnknownLayout { what, path: folder.to_owned() });
@@ -34,14 +31,10 @@ pub(crate) fn raw_file_names(folder: &Path) -> Result<Vec<OsString>, DataError> 
     Ok(names)
 }
 
-/// Decodes a name as UTF-8, or else as Latin-1.
+/// Decodes a name as UTF-8, or else as Latin-1, and composes its characters: macOS writes an umlaut as a letter and a mark.
 pub(crate) fn decode_name(bytes: &[u8]) -> String {
-    str::from_utf8(bytes).map_or_else(|_| bytes.iter().copied().map(char::from).collect(), str::to_owned)
-}
-
-/// Returns a name with composed characters: macOS writes an umlaut as a letter and a mark, other systems as one character.
-pub(crate) fn composed(name: &str) -> Cow<'_, str> {
-    if is_nfc(name) { Cow::Borrowed(name) } else { Cow::Owned(name.nfc().collect()) }
+    let latin = || bytes.iter().copied().map(char::from).collect();
+    str::from_utf8(bytes).map_or_else(|_| latin(), |name| name.nfc().collect())
 }
 
 /// Returns whether a name has the extension `ending`, case-sensitive.

@@ -3,7 +3,6 @@
 use clift_core::{Camera, IntrinsicsNorm, Pose};
 use glam::DVec3;
 
-/// Rays along each side of the image.
 const SIDE: usize = 32;
 
 /// Returns the share in `[0, 1]` of the image of `from` that `to` may see: the rays of a 32 x 32 grid with any point in
@@ -45,7 +44,6 @@ fn is_seen(motion: Pose, direction: DVec3, to: &Camera<IntrinsicsNorm>) -> bool 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clift_core::{step_rng, uniform_01};
     use glam::DMat3;
 
     fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera<IntrinsicsNorm> {
@@ -65,35 +63,9 @@ mod tests {
         assert_eq!(overlap(&here, &camera(0.0, [0.0, 0.0, 3.0])), 1.0);
         // Face to face: a part of every ray lies between the cameras.
         assert_eq!(overlap(&here, &camera(180.0, [0.0, 0.0, 3.0])), 1.0);
-    }
-
-    #[test]
-    fn turning_by_half_the_view_leaves_less_than_half() {
         // A camera turned by 45 degrees sees half of the columns, and in these not all rows.
-        let share = overlap(&camera(0.0, [0.0; 3]), &camera(45.0, [0.0; 3]));
+        let share = overlap(&here, &camera(45.0, [0.0; 3]));
         assert!((0.35..0.5).contains(&share), "{share}");
-        assert_eq!(share, overlap(&camera(0.0, [0.0; 3]), &camera(-45.0, [0.0; 3])));
-    }
-
-    #[test]
-    fn is_seen_agrees_with_sampled_depths() {
-        let (mut num_seen, mut num_missed) = (0, 0);
-        for i in 0..2000 {
-            let mut rng = step_rng(3, i, "test");
-            let mut around = |size: f64| (2.0 * uniform_01(&mut rng) - 1.0) * size;
-            let to = camera(around(90.0), [around(2.0), around(2.0), around(2.0)]);
-            let direction = DVec3::new(around(1.0), around(1.0), 1.0);
-            let motion = to.c2w.inverse();
-            let tried = (0..4000).map(|step| 1e-3 * 1.005_f64.powi(step)).any(|t| {
-                let [x, y, z] = motion.apply(direction * t).to_array();
-                z > 0.0 && (0.5 * x / z).abs() < 0.5 && (0.5 * y / z).abs() < 0.5
-            });
-            let seen = is_seen(motion, direction, &to);
-            assert!(seen || !tried, "{i}");
-            num_seen += usize::from(seen);
-            num_missed += usize::from(seen && !tried);
-        }
-        // Sampled depths may miss a short visible interval.
-        assert!((300..1700).contains(&num_seen) && num_missed < 20, "{num_missed} of {num_seen}");
+        assert_eq!(share, overlap(&here, &camera(-45.0, [0.0; 3])));
     }
 }

@@ -1,48 +1,22 @@
-//! Poses to render, from a file of poses or the `transforms.json` of a capture.
+//! Poses to render, from a file.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
 
 use clift_core::{Camera, Intrinsics, IntrinsicsNorm, Pose, PoseNormalization, check_near};
 use serde::Deserialize;
-use serde::de::IgnoredAny;
 
 use crate::error::DataError;
 use crate::files::bounded::{parse_json, read_bounded};
-use crate::files::listing::natural_order;
 
-/// Largest size of a file, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
 const MAX_POSES: usize = 100_000;
 /// Accepted focal lengths over width and height; the upper bound also limits the principal point's distance from 0.
 const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
 
 #[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
 struct PoseFile {
     poses: Vec<FilePose>,
-}
-
-/// The keys that tell the form of a file.
-#[derive(Deserialize)]
-struct FileForm {
-    poses: Option<IgnoredAny>,
-    frames: Option<IgnoredAny>,
-}
-
-/// The poses of a `transforms.json`.
-#[derive(Deserialize)]
-struct TransformsFile {
-    frames: Vec<TransformsFrame>,
-}
-
-/// One frame of a `transforms.json`.
-#[derive(Deserialize)]
-struct TransformsFrame {
-    #[serde(default)]
-    file_path: String,
-    /// Three or four rows of a camera-to-world matrix, OpenGL axes.
-    transform_matrix: Vec<[f64; 4]>,
 }
 
 #[derive(Deserialize)]
@@ -60,9 +34,6 @@ struct FilePose {
 /// Poses are camera to world in the world of the capture's files, OpenCV axes. Images have `width` by `height` pixels.
 /// A pose without intrinsics gets `default`.
 ///
-/// The file may also be the `transforms.json` of the capture: its poses in the natural order of the image names, all with
-/// the intrinsics `default`.
-///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with the position of the pose.
 pub fn read_poses(
@@ -74,24 +45,12 @@ pub fn read_poses(
 ) -> Result<Vec<Camera>, DataError> {
     let text = read_bounded(path, MAX_BYTES, "reading the poses")?;
     let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
-    let wrong_form = |error: serde_json::Error| {
-        bad(format!("expected a transforms.json or {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))
-    };
-    let form: FileForm = parse_json(&text).map_err(wrong_form)?;
-    let is_transforms = form.frames.is_some() && form.poses.is_none();
-    let poses: Vec<FilePose> = if is_transforms {
-        let mut file: TransformsFile = parse_json(&text).map_err(wrong_form)?;
-        file.frames.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
-        let pose = |frame: TransformsFrame| FilePose { c2w: frame.transform_matrix, intrinsics_norm: None };
-        file.frames.into_iter().map(pose).collect()
-    } else {
-        let file: PoseFile = parse_json(&text).map_err(wrong_form)?;
-        file.poses
-    };
+    let PoseFile { poses } = parse_json(&text).map_err(|error: serde_json::Error| {
+        bad(format!("expected {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))
+    })?;
     if !(1..=MAX_POSES).contains(&poses.len()) {
         return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", poses.len())));
     }
-    let from_rows = if is_transforms { Pose::from_opengl } else { Pose::from_rows };
     let is_near = |cx: f64, cy: f64| [cx, cy].iter().all(|centre| centre.abs() <= *INTRINSICS.end());
     let view = |(position, pose): (usize, FilePose)| {
         let bad = |what: String| bad(format!("pose {position}: {what}"));
@@ -103,7 +62,7 @@ pub fn read_poses(
         if last != [0.0, 0.0, 0.0, 1.0] {
             return Err(bad(format!("the last row is {last:?}, expected [0, 0, 0, 1]")));
         }
-        let c2w = normalization.normalize(from_rows(&rows).map_err(|error| bad(error.to_string()))?);
+        let c2w = normalization.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
         check_near(&c2w).map_err(|error| bad(error.to_string()))?;
         let intrinsics = match pose.intrinsics_norm {
             None => default,
@@ -132,7 +91,6 @@ mod tests {
 
     const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
 
-    /// A pose at a place, its axes those of the world.
     fn pose(centre: [f64; 3]) -> Pose {
         Pose { rotation: DMat3::IDENTITY, translation: centre.into() }
     }
@@ -161,22 +119,9 @@ mod tests {
     }
 
     #[test]
-    fn poses_of_a_transforms_file_have_opengl_axes() {
-        let views = read(
-            r#"{"w": 64, "frames": [
-                {"file_path": "b/10.jpg", "transform_matrix": [[1,0,0,5],[0,-1,0,0],[0,0,-1,2],[0,0,0,1]]},
-                {"file_path": "b/9.jpg", "transform_matrix": [[1,0,0,1],[0,-1,0,0],[0,0,-1,0],[0,0,0,1]]}]}"#,
-        )
-        .unwrap();
-        assert_close(&views[0], [0.0; 3]);
-        assert_close(&views[1], [8.0, 0.0, 4.0]);
-        assert_eq!(views[1].intrinsics, K);
-    }
-
-    #[test]
     fn invalid_pose_files_name_pose_and_problem() {
         for (json, part) in [
-            ("[]", "expected a transforms.json or {\"poses\": "),
+            ("[]", "expected {\"poses\": "),
             (r#"{"poses": []}"#, "0 poses, expected 1 to 100000"),
             (r#"{"poses": [{"c2w": [[1,0,0,0]]}]}"#, "pose 0: 1 rows, expected 3 or 4"),
             (r#"{"poses": [{"c2w": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: the rotation is off"),
@@ -193,9 +138,7 @@ mod tests {
                 r#"{"poses": [{"c2w": [[1,0,0,506],[0,1,0,0],[0,0,1,0]]}]}"#,
                 "pose 0: bad camera: the camera is 1010 times the contexts' extent away",
             ),
-            (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
-            (r#"{"frames": []}"#, "0 poses, expected 1 to 100000"),
-            (r#"{"frames": [{"file_path": "a.jpg"}]}"#, "missing field `transform_matrix`"),
+            (r#"{"pose": []}"#, "missing field `poses`"),
         ] {
             let message = read(json).unwrap_err().to_string();
             assert!(message.contains(part) && message.ends_with("poses.json"), "{message}");

@@ -29,8 +29,7 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 /// [`DataError::BadImage`] with `key` and `frame` for another format, broken or truncated data, and a side above
 /// 16,384 pixels.
 pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
-    let image = decode(bytes).and_then(|image| rgb_image(image.into_rgb8()));
-    image.map_err(|what| bad_image(key, frame, what))
+    decode_with_alpha(bytes, key, frame).map(|(image, _)| image)
 }
 
 /// Decodes a JPEG or PNG file as [`decode_image`], and its alpha channel, `[height, width]`, if it has one.
@@ -39,13 +38,10 @@ pub(crate) fn decode_with_alpha(
     key: &str,
     frame: usize,
 ) -> Result<(RgbImage, Option<Vec<u8>>), DataError> {
-    let image = decode(bytes).map_err(|what| bad_image(key, frame, what))?;
+    let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
+    let image = decode(bytes).map_err(bad)?;
     let alpha = image.color().has_alpha().then(|| image.to_rgba8().pixels().map(|pixel| pixel.0[3]).collect());
-    Ok((rgb_image(image.into_rgb8()).map_err(|what| bad_image(key, frame, what))?, alpha))
-}
-
-fn bad_image(key: &str, frame: usize, what: String) -> DataError {
-    DataError::BadImage { key: key.to_owned(), frame, what }
+    Ok((rgb_image(image.into_rgb8()), alpha))
 }
 
 /// Decodes a JPEG or PNG file.
@@ -55,15 +51,16 @@ fn bad_image(key: &str, frame: usize, what: String) -> DataError {
 pub(crate) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
     let mut reader = ImageReader::with_format(Cursor::new(bytes), known_format(bytes)?);
     reader.limits(limits());
-    reader.decode().map_err(|error| error.to_string())
+    let image = reader.decode().map_err(|error| error.to_string())?;
+    match (image.width(), image.height()) {
+        (0, _) | (_, 0) => Err(format!("the image is {}x{}", image.width(), image.height())),
+        _ => Ok(image),
+    }
 }
 
-fn rgb_image(image: image::RgbImage) -> Result<RgbImage, String> {
+fn rgb_image(image: image::RgbImage) -> RgbImage {
     let (width, height) = image.dimensions();
-    if width == 0 || height == 0 {
-        return Err(format!("the image is {width}x{height}"));
-    }
-    Ok(RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() })
+    RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() }
 }
 
 fn limits() -> Limits {
@@ -72,15 +69,6 @@ fn limits() -> Limits {
     limits.max_image_height = Some(MAX_SIDE);
     limits.max_alloc = Some(MAX_DECODE_BYTES);
     limits
-}
-
-/// Checks format, header and end of a JPEG or PNG file without decoding the image, which takes a hundred times as long.
-pub(crate) fn check_encoded(bytes: &[u8]) -> Result<(), String> {
-    let format = known_format(bytes)?;
-    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
-    reader.limits(limits());
-    let (width, height) = reader.into_dimensions().map_err(|error| error.to_string().trim_end().to_owned())?;
-    if width == 0 || height == 0 { Err(format!("the image is {width}x{height}")) } else { Ok(()) }
 }
 
 /// Returns the format of a JPEG or PNG file with an end marker.
@@ -95,7 +83,6 @@ pub(crate) fn known_format(bytes: &[u8]) -> Result<ImageFormat, String> {
     Err(format!("the {name} data of {} bytes is truncated", bytes.len()))
 }
 
-/// Returns whether the data of a JPEG or PNG file has its end marker.
 fn has_end(bytes: &[u8], format: ImageFormat) -> bool {
     if format == ImageFormat::Png {
         bytes.windows(PNG_END.len()).rev().any(|part| part == PNG_END)
@@ -148,7 +135,6 @@ pub(crate) fn exif_orientation(bytes: &[u8]) -> Orientation {
     decoder.and_then(|mut decoder| decoder.orientation().ok()).unwrap_or(Orientation::NoTransforms)
 }
 
-/// Turns or mirrors an image by its EXIF orientation.
 pub(crate) fn apply_orientation(image: RgbImage, orientation: Orientation) -> RgbImage {
     if orientation == Orientation::NoTransforms {
         return image;
@@ -158,9 +144,7 @@ pub(crate) fn apply_orientation(image: RgbImage, orientation: Orientation) -> Rg
     let pixels = image::RgbImage::from_raw(width as u32, height as u32, rgb).unwrap_or_default();
     let mut turned = DynamicImage::ImageRgb8(pixels);
     turned.apply_orientation(orientation);
-    let turned = turned.into_rgb8();
-    let (width, height) = turned.dimensions();
-    RgbImage { width: width as usize, height: height as usize, rgb: turned.into_raw() }
+    rgb_image(turned.into_rgb8())
 }
 
 /// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes only, or the whole
@@ -182,7 +166,8 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     if has_end(&bytes, image::guess_format(&bytes).unwrap_or(ImageFormat::Jpeg)) {
         return Ok(());
     }
-    Err(DataError::TruncatedImage { num_bytes, path: path.to_owned() })
+    let what = format!("the image is truncated: its {num_bytes} bytes have no end marker");
+    Err(DataError::BadPhoto { reason: "whose image is truncated", what, path: path.to_owned() })
 }
 
 /// Returns whether the JPEG data has its end marker. The decoder fills the missing part of a truncated JPEG with gray.
@@ -220,15 +205,13 @@ fn has_end_after_scan(bytes: &[u8]) -> Option<bool> {
 /// [`DataError::Encode`] for an image whose `rgb` does not match its size, and beyond the limits of the format.
 pub fn encode_jpeg(image: &RgbImage, quality: u8) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
-    encode(JpegEncoder::new_with_quality(&mut bytes, quality), image)?;
-    Ok(bytes)
+    encode(JpegEncoder::new_with_quality(&mut bytes, quality), image).map(|()| bytes)
 }
 
 /// Encodes an image as PNG (lossless).
 pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
-    encode(PngEncoder::new(&mut bytes), image)?;
-    Ok(bytes)
+    encode(PngEncoder::new(&mut bytes), image).map(|()| bytes)
 }
 
 fn encode(encoder: impl ImageEncoder, image: &RgbImage) -> Result<(), DataError> {
@@ -270,31 +253,6 @@ mod tests {
         assert_eq!(decode_image(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
         let message = decode_image(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
         assert!(message.ends_with("the 10 bytes are neither JPEG nor PNG"), "{message}");
-    }
-
-    #[test]
-    fn unreadable_data_is_found_without_decoding() {
-        for image in [encode_jpeg(&ramp(40, 24), 90).unwrap(), encode_png(&ramp(40, 24)).unwrap()] {
-            assert_eq!(check_encoded(&image), Ok(()));
-            let half = check_encoded(&image[..image.len() / 2]).unwrap_err();
-            assert!(half.contains("is truncated"), "{half}");
-        }
-        for (bytes, expected) in [
-            (&b""[..], "the 0 bytes are neither JPEG nor PNG"),
-            (b"RIFF....WEBPVP8 ", "the 16 bytes are neither JPEG nor PNG"),
-        ] {
-            assert_eq!(check_encoded(bytes).unwrap_err(), expected);
-        }
-        assert!(check_encoded(b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9").is_err(), "no size");
-        // Bytes that cannot be decoded are not a frame.
-        let folder = tempfile::tempdir().unwrap();
-        for (width, is_ok) in [(MAX_SIDE as usize, true), (MAX_SIDE as usize + 1, false)] {
-            let wide = encode_png(&ramp(width, 1)).unwrap();
-            let path = folder.path().join("wide.png");
-            std::fs::write(&path, &wide).unwrap();
-            let found = [check_encoded(&wide).is_ok(), read_header(&path).is_ok(), decode_image(&wide, "k", 0).is_ok()];
-            assert_eq!(found, [is_ok; 3], "{width} columns");
-        }
     }
 
     #[test]

@@ -13,7 +13,6 @@ use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkipReport;
 
-/// Largest size of an index, in bytes.
 const MAX_BYTES: u64 = 1 << 30;
 
 /// An evaluation index in the published form `{key: {"context": [..], "target": [..]} | null | {}}`, in file order.
@@ -71,16 +70,6 @@ impl EvaluationIndex {
             target.retain(|frame| !context.contains(frame));
         }
         self
-    }
-
-    /// Returns the number of keys, null and empty entries included.
-    pub fn num_keys(&self) -> usize {
-        self.entries.len()
-    }
-
-    /// Iterates over the entries with views, in file order.
-    pub fn usable(&self) -> impl Iterator<Item = (&str, &ViewIndices)> {
-        self.entries.iter().filter_map(|(key, views)| Some((key.as_str(), views.as_ref()?)))
     }
 
     /// Selects the first `limit` evaluable scenes of `source` (0: all), in file order.
@@ -186,8 +175,7 @@ pub fn even_views_of(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene_source::Split;
-    use crate::testing::{TestSource, fixture, re10k_mini, read_from_file, rooms};
+    use crate::testing::{TestSource, read_from_file, rooms};
 
     fn index(json: &str) -> Result<EvaluationIndex, DataError> {
         read_from_file("index.json", json, EvaluationIndex::read)
@@ -213,32 +201,6 @@ mod tests {
     }
 
     #[test]
-    fn null_and_empty_entries_have_no_views() {
-        let index = index(
-            r#"{"c": {"context": [5, 1], "target": [2, 2], "overlap": 0.5}, "b": null, "d": {}, "a": {"context": [0], "target": [0]}}"#,
-        )
-        .unwrap();
-        assert_eq!(index.num_keys(), 4);
-        let [c, a] =
-            [[vec![5, 1], vec![2, 2]], [vec![0], vec![0]]].map(|[context, target]| ViewIndices { context, target });
-        assert_eq!(index.usable().collect::<Vec<_>>(), [("c", &c), ("a", &a)]);
-    }
-
-    #[test]
-    fn context_targets_are_counted_and_removed() {
-        let source = rooms(|c| c.num_scenes = 2);
-        let (a, b) = (source.key(0), source.key(1));
-        let text = format!(
-            r#"{{"{a}": {{"context": [0, 5], "target": [5, 2, 0]}}, "{b}": {{"context": [0, 5], "target": [0]}}}}"#
-        );
-        let index = index(&text).unwrap();
-        assert_eq!(index.usable().map(|(_, views)| views.num_context_targets()).collect::<Vec<_>>(), [2, 1]);
-        let (items, report) = index.without_context_targets().select(&source, 0);
-        assert_eq!(items, [EvaluationItem { scene: 0, views: ViewIndices { context: vec![0, 5], target: vec![2] } }]);
-        assert_eq!(report.to_string(), "1 of 2 scenes used; 1 with contexts as its only targets");
-    }
-
-    #[test]
     fn invalid_forms_are_refused_with_the_reason() {
         let message = |json: &str| index(json).unwrap_err().to_string();
         assert!(message("[]").contains("expected {key:"), "{}", message("[]"));
@@ -248,32 +210,24 @@ mod tests {
     }
 
     #[test]
-    fn skipped_entries_are_counted() {
-        let index = EvaluationIndex::read(&fixture("re10k-mini/evaluation_index.json")).unwrap();
-        let (items, report) = index.select(&re10k_mini(Split::Test), 0);
-        let views = ViewIndices { context: vec![0, 2, 5, 7], target: vec![1, 3, 4, 6] };
-        assert_eq!(items, [EvaluationItem { scene: 0, views }]);
-        assert_eq!(report.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
-        let (items, report) = index.select(&re10k_mini(Split::Train), 0);
-        assert!(items.is_empty());
-        assert_eq!(report.counts()["not in the data"], 1);
-    }
-
-    #[test]
     fn unusable_entries_are_skipped_up_to_the_limit() {
         let broken = || DataError::bad_camera("the pose holds NaN".into());
         let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (5, 8)))
-            .with_cameras(move |scene, cameras| if scene == 1 { Err(broken()) } else { Ok(cameras) });
+            .with_cameras(move |base, scene| if scene == 1 { Err(broken()) } else { base.cameras(scene) });
         let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8
         let entries: Vec<String> = (0..5)
             .map(|scene| {
-                format!(r#""{}": {{"context": [0, {}], "target": [3]}}"#, source.key(scene), last_frames[scene])
+                format!(r#""{}": {{"context": [0, {}], "target": [3, 0]}}"#, source.key(scene), last_frames[scene])
             })
             .collect();
-        let index = index(&format!("{{{}}}", entries.join(","))).unwrap();
+        let others = r#""none": null, "empty": {}, "a": {"context": [0, 2], "target": [3]}, "b": {"context": [0, 2], "target": [2]}"#;
+        let index = index(&format!("{{{}, {others}}}", entries.join(","))).unwrap().without_context_targets();
         let scenes = |items: &[EvaluationItem]| items.iter().map(|item| item.scene).collect::<Vec<_>>();
         let (items, report) = index.select(&source, 0);
-        assert_eq!((scenes(&items), report.num_scenes), (vec![2, 3, 4], 5));
+        assert_eq!((scenes(&items), report.num_scenes), (vec![2, 3, 4], 9));
+        assert_eq!((&items[0].views.target[..], report.counts()["with contexts as its only targets"]), (&[3][..], 1));
+        assert_eq!(report.counts()["without views in the evaluation index"], 2);
+        assert_eq!(report.counts()["not in the data"], 1);
         assert!(report.skips[0].reason.contains("frame 8 of scene"), "{report}");
         assert_eq!(report.skips[1].reason, "bad camera: the pose holds NaN");
         let (items, report) = index.select(&source, 2);

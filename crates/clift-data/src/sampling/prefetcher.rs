@@ -19,13 +19,11 @@ type Make<T, E> = dyn Fn(u64) -> Result<T, E> + Send + Sync;
 pub struct Prefetcher<T, E> {
     make: Arc<Make<T, E>>,
     start_step: u64,
-    /// Steps that have not been taken.
     steps: Range<u64>,
     /// Lane `i` of `n` makes the steps `start_step + i`, `start_step + i + n`, ..; `None` makes them when they are taken.
     lanes: Vec<Option<Lane<T, E>>>,
 }
 
-/// A thread and its finished items, in step order.
 struct Lane<T, E> {
     items: Receiver<Result<T, E>>,
     worker: JoinHandle<()>,
@@ -189,19 +187,5 @@ mod tests {
             assert_eq!(made.load(Ordering::SeqCst), taken + 5);
             assert_eq!(items.next(), Some(Ok(taken)));
         }
-    }
-
-    #[test]
-    fn dropping_a_full_prefetcher_ends_its_threads() {
-        let alive = Arc::new(());
-        let inside = Arc::clone(&alive);
-        let make = move |step| {
-            assert!(Arc::strong_count(&inside) > 0);
-            Ok::<_, Failure>(step)
-        };
-        let mut items = Prefetcher::new(make, 0, u64::MAX, 3, 2);
-        assert_eq!(items.next(), Some(Ok(0)));
-        within_seconds(move || drop(items));
-        assert_eq!(Arc::strong_count(&alive), 1, "a thread still holds the closure");
     }
 }

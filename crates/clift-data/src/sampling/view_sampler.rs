@@ -1,22 +1,19 @@
 //! Samples the context and target frames of a training item.
 
-use clift_core::{BadConfig, Pose, ViewDistance, check_config, sample_from, step_rng, uniform_below, uniform_between};
-use glam::DVec3;
+use clift_core::{
+    BadConfig, Pose, ViewDistance, check_config, sample_distinct, sample_from, step_rng, uniform_below, uniform_between,
+};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::sampling::clip::ViewIndices;
-use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;
 
 const MAX_VIEWS: usize = 10_000;
 
-/// Returns the value at `step` of a linear warm-up from `init` to `last` in `warm_up_steps` steps:
-/// `min(init + trunc((last - init) * step / warm_up_steps), last)`.
-///
-/// Expects `init <= last`. Without warm-up steps the value is always `last`.
-pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usize {
+/// Returns the value at `step` of a linear warm-up from `init` to `last >= init`, truncated.
+fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usize {
     if warm_up_steps == 0 || step >= warm_up_steps {
         return last;
     }
@@ -56,12 +53,8 @@ pub struct ViewSampler {
     /// Whether items of few contexts have shorter gaps: divided by `max_context / num_context`, rounded down, as in
     /// `DepthSplat`.
     pub shorten_gaps: bool,
-    /// Number of target views of an item.
+    /// Number of target views of an item. Targets may repeat, and may be context frames.
     pub num_targets: usize,
-    /// Whether targets may repeat. A target may also be a context frame in both cases.
-    pub with_replacement: bool,
-    /// Selection of the contexts between the two ends: `random`, `farthest_point` or `even`.
-    pub inner: InnerViews,
     /// The range: `consecutive` frames, or a frame and those `nearest` to it, as in photos without an order.
     pub window: Window,
 }
@@ -76,8 +69,6 @@ impl Default for ViewSampler {
             warm_up_steps: 30_000,
             shorten_gaps: true,
             num_targets: 6,
-            with_replacement: true,
-            inner: InnerViews::Random,
             window: Window::Consecutive,
         }
     }
@@ -112,10 +103,6 @@ impl ViewSampler {
                 let needed = (num_context - 1) * self.gap_divisor(num_context);
                 format!("{num_context} distinct contexts need a gap of {needed} or more")
             })?;
-            check_config(self.with_replacement || num_frames >= num_targets, "num_targets", num_targets, || {
-                let gap = num_frames - 1;
-                format!("a gap of {gap} has {num_frames} frames, so use fewer or with_replacement")
-            })?;
         }
         Ok(())
     }
@@ -143,9 +130,8 @@ impl ViewSampler {
     /// Samples the views of one item from a scene of `source`. Cameras are read only where they decide.
     ///
     /// # Errors
-    /// [`DataError::NotEnoughFrames`] if the scene is not longer than the smallest gap at `step`,
-    /// [`DataError::BadConfig`] if `num_context` is outside `[min_context, max_context]`, and the errors of reading the
-    /// scene.
+    /// [`DataError::NotEnoughFrames`] if the scene is not longer than the smallest gap at `step`, and the errors of reading
+    /// the scene.
     pub fn sample(
         &self,
         source: &dyn SceneSource,
@@ -154,15 +140,10 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
-        if self.window == Window::Consecutive && !self.inner.needs_centres() {
-            return self.sample_frames(source.num_frames(scene)?, &[], step, num_context, rng);
+        match self.poses(source, scene)? {
+            None => self.sample_frames(source.num_frames(scene)?, step, num_context, rng),
+            Some(poses) => self.sample_nearest(&poses, step, num_context, rng),
         }
-        let poses: Vec<Pose> = source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
-        if self.window == Window::Nearest {
-            return self.sample_nearest(&poses, step, num_context, rng);
-        }
-        let centres: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
-        self.sample_frames(centres.len(), &centres, step, num_context, rng)
     }
 
     /// Samples the views of one item among a frame and those nearest to it: as many as a range has.
@@ -176,28 +157,25 @@ impl ViewSampler {
         let gap = self.sample_gap(poses.len(), step, num_context, rng)?;
         let seed = uniform_below(rng, poses.len());
         let frames = ViewDistance::new(poses).nearest(poses, seed, gap + 1);
-        let centres: Vec<DVec3> = frames.iter().map(|&frame| poses[frame].translation).collect();
-        let ViewIndices { context, target } = self.sample_between(0, gap, num_context, &centres, rng);
+        let ViewIndices { context, target } = self.sample_between(0, gap, num_context, rng);
         let of_scene = |positions: Vec<usize>| positions.into_iter().map(|position| frames[position]).collect();
         Ok(ViewIndices { context: of_scene(context), target: of_scene(target) })
     }
 
-    /// Samples the views of one item from a scene of `num_frames` frames. `centres` are the camera centres, empty
-    /// unless [`InnerViews::needs_centres`].
+    /// Samples the views of one item from a scene of `num_frames` frames.
     ///
     /// The contexts are distinct and sorted. The targets lie between the ends, inclusive, in the sampled order. Expects
     /// a sampler that passes [`validate`](Self::validate).
     pub(crate) fn sample_frames(
         &self,
         num_frames: usize,
-        centres: &[DVec3],
         step: u64,
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
         let gap = self.sample_gap(num_frames, step, num_context, rng)?;
         let left = uniform_below(rng, num_frames - gap);
-        Ok(self.sample_between(left, left + gap, num_context, centres, rng))
+        Ok(self.sample_between(left, left + gap, num_context, rng))
     }
 
     /// Samples the gap of an item from a scene of `num_frames` frames, and checks that it can have one.
@@ -208,10 +186,6 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<usize, DataError> {
-        let Self { min_context, max_context, .. } = *self;
-        check_config((min_context..=max_context).contains(&num_context), "num_context", num_context, || {
-            format!("use {min_context} to {max_context}")
-        })?;
         let [min_gap, max_gap] = self.gap_bounds(step, num_context);
         if num_frames <= min_gap {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });
@@ -219,20 +193,10 @@ impl ViewSampler {
         Ok(uniform_between(rng, min_gap, max_gap.min(num_frames - 1)))
     }
 
-    fn sample_between(
-        &self,
-        left: usize,
-        right: usize,
-        num_context: usize,
-        centres: &[DVec3],
-        rng: &mut impl Rng,
-    ) -> ViewIndices {
-        let target = if self.with_replacement {
-            (0..self.num_targets).map(|_| uniform_between(rng, left, right)).collect()
-        } else {
-            sample_from(rng, (left..=right).collect(), self.num_targets)
-        };
-        let inner = self.inner.choose(rng, left, right, num_context - 2, centres);
+    fn sample_between(&self, left: usize, right: usize, num_context: usize, rng: &mut impl Rng) -> ViewIndices {
+        let target = (0..self.num_targets).map(|_| uniform_between(rng, left, right)).collect();
+        let inner = sample_distinct(rng, right - left - 1, num_context - 2);
+        let inner = inner.into_iter().map(|offset| left + 1 + offset);
         let context = std::iter::once(left).chain(inner).chain([right]).collect();
         ViewIndices { context, target }
     }
@@ -251,12 +215,17 @@ impl ViewSampler {
         context: &[usize],
         rng: &mut impl Rng,
     ) -> Result<Vec<usize>, DataError> {
-        let poses: Option<Vec<Pose>> = match self.window {
-            Window::Consecutive => None,
-            Window::Nearest => Some(source.cameras(scene)?.iter().map(|camera| camera.c2w).collect()),
-        };
+        let poses = self.poses(source, scene)?;
         let candidates = target_candidates(context, source.num_frames(scene)?, poses.as_deref())?;
         Ok(sample_candidates(context, candidates, self.num_targets, rng))
+    }
+
+    /// Returns the poses of a scene where they decide.
+    fn poses(&self, source: &dyn SceneSource, scene: usize) -> Result<Option<Vec<Pose>>, DataError> {
+        Ok(match self.window {
+            Window::Consecutive => None,
+            Window::Nearest => Some(source.cameras(scene)?.iter().map(|camera| camera.c2w).collect()),
+        })
     }
 
     fn gap_divisor(&self, num_context: usize) -> usize {

@@ -10,18 +10,14 @@ use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
 use crate::sources::photos::image_folder::num_images;
 use crate::sources::photos::re10k_text::looks_like_re10k;
-use crate::sources::photos::scene_folder::{
-    FoundScenes, SceneFiles, SceneFolder, find_scenes, scene_in, transforms_in,
-};
+use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder, find_scenes, scene_in, transforms_in};
 
 /// The folder, or the file of a single scene, that a data set is opened from.
 pub struct DatasetRoot {
     /// Path of the root.
     pub path: PathBuf,
-    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`.
-    ///
-    /// A capture may have such a name as well, such as `train` of Tanks and Temples. A capture counts as a split only if
-    /// the other split is a capture too and no third capture lies beside them.
+    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`: not if one of these is a capture,
+    /// such as `train` of Tanks and Temples.
     pub has_splits: bool,
 }
 
@@ -29,28 +25,11 @@ impl DatasetRoot {
     /// Finds a data set and its split folders.
     pub fn find(path: &Path) -> Result<Self, DataError> {
         std::fs::metadata(path).map_err(DataError::io("opening the data", path))?;
-        Ok(Self { path: path.to_owned(), has_splits: has_splits(path) })
+        let mut splits = [Split::Train, Split::Test].map(|split| path.join(split.to_string())).to_vec();
+        splits.retain(|split| split.is_dir());
+        let is_capture = scene_in(path).is_some() || splits.iter().any(|split| scene_in(split).is_some());
+        Ok(Self { path: path.to_owned(), has_splits: !splits.is_empty() && !is_capture })
     }
-}
-
-fn has_splits(root: &Path) -> bool {
-    let splits = [Split::Train, Split::Test].map(|split| split.to_string());
-    let present: Vec<&String> = splits.iter().filter(|split| root.join(split).is_dir()).collect();
-    if present.is_empty() || scene_in(root).is_some() {
-        return false;
-    }
-    let is_capture = |name: &String| scene_in(&root.join(name)).is_some_and(|files| files.is_capture());
-    if !present.iter().any(|split| is_capture(split)) {
-        return true;
-    }
-    let names = file_names(root).unwrap_or_default();
-    present.len() == splits.len() && !names.iter().any(|name| !splits.contains(name) && is_capture(name))
-}
-
-/// The scenes detected in a folder; for photos, with a report of the skipped ones.
-pub(crate) enum DetectedSource {
-    Torch(SourceKind),
-    Photos(SourceKind, Vec<SceneFolder>, SkipReport),
 }
 
 /// The folder of one split; without split folders, the root.
@@ -67,43 +46,42 @@ impl<'a> SplitFolder<'a> {
         if folder.base.exists() {
             return Ok(folder);
         }
-        Err(folder.no_scenes(&format!("no folder {split}/ beside the other split"), &[]))
+        Err(folder.no_scenes(&format!("no folder {split}/ beside the other split")))
     }
 
-    /// Finds the scenes of the requested kind, or of the detected kind.
-    pub fn detect(&self, asked: SourceKind) -> Result<DetectedSource, DataError> {
+    /// Finds the requested kind, or detects it. Folders of photos are returned, with a report of those that are skipped; those
+    /// of other layouts are not.
+    pub fn detect(&self, asked: SourceKind) -> Result<(SourceKind, Vec<SceneFolder>, SkipReport), DataError> {
         let base = &self.base;
         if base.is_file() {
             let kind = if asked == SourceKind::Auto { SourceKind::Captures } else { asked };
-            return Ok(DetectedSource::Photos(kind, vec![SceneFolder::of_file(base)], SkipReport::default()));
+            return Ok((kind, vec![SceneFolder::of_file(base)], SkipReport::default()));
         }
         let names = file_names(base)?;
         let has_torch = names.iter().any(|name| has_ending(name, "torch"));
-        match asked {
-            SourceKind::Chunks => return Ok(DetectedSource::Torch(SourceKind::Chunks)),
-            SourceKind::Scenes if has_torch => return Ok(DetectedSource::Torch(SourceKind::Scenes)),
-            SourceKind::Scenes => return Err(self.no_scenes("expected .torch files", &[])),
-            SourceKind::Auto if names.iter().any(|name| name == "index.json") => {
-                return Ok(DetectedSource::Torch(SourceKind::Chunks));
-            }
-            SourceKind::Auto if has_torch => return Ok(DetectedSource::Torch(SourceKind::Scenes)),
-            _ => {}
+        let has_text = || {
+            let mut texts = names.iter().filter(|name| has_ending(name, "txt")).take(8);
+            texts.any(|name| looks_like_re10k(&base.join(name)))
+        };
+        let flat = match asked {
+            SourceKind::Auto if names.iter().any(|name| name == "index.json") => Some(SourceKind::Chunks),
+            SourceKind::Auto if has_torch => Some(SourceKind::Scenes),
+            SourceKind::Auto => has_text().then_some(SourceKind::Re10kTxt),
+            SourceKind::Chunks => Some(asked),
+            SourceKind::Scenes if has_torch => Some(asked),
+            SourceKind::Scenes => return Err(self.no_scenes("expected .torch files")),
+            SourceKind::Re10kTxt if has_text() => Some(asked),
+            SourceKind::Re10kTxt => return Err(self.no_scenes("expected .txt files of RealEstate10K")),
+            _ => None,
+        };
+        if let Some(kind) = flat {
+            return Ok((kind, Vec::new(), SkipReport::default()));
         }
-        if matches!(asked, SourceKind::Auto | SourceKind::Re10kTxt) {
-            let texts: Vec<&String> = names.iter().filter(|name| has_ending(name, "txt")).collect();
-            if scene_in(base).is_none() && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
-                return Ok(DetectedSource::Photos(SourceKind::Re10kTxt, Vec::new(), SkipReport::default()));
-            }
-        }
-        let FoundScenes { mut scenes, others, notes, without_cameras } = find_scenes(base)?;
+        let (mut scenes, without_cameras) = find_scenes(base)?;
         let kind = if asked == SourceKind::Auto { self.recognise(&scenes)? } else { asked };
-        let mut report = SkipReport { notes, ..SkipReport::default() };
+        let mut report = SkipReport::default();
         scenes.retain(|scene| {
-            let is_of_kind = match kind {
-                SourceKind::Re10kTxt => matches!(scene.files, SceneFiles::Re10kText { .. }),
-                SourceKind::Dl3dv => matches!(scene.files, SceneFiles::Transforms(_)),
-                _ => true,
-            };
+            let is_of_kind = kind != SourceKind::Dl3dv || matches!(scene.files, SceneFiles::Transforms(_));
             if !is_of_kind {
                 report.num_scenes += 1;
                 report.skip(&scene.key, format!("with cameras in another format than {kind}"));
@@ -111,37 +89,30 @@ impl<'a> SplitFolder<'a> {
             is_of_kind
         });
         if scenes.is_empty() {
-            let what = match asked {
+            return Err(self.no_scenes(match asked {
                 SourceKind::Auto => {
                     "expected index.json with chunks, .torch files, .txt files of RealEstate10K, or folders with a \
                      transforms.json or a COLMAP model, at most three levels down"
                 }
-                SourceKind::Re10kTxt => "expected .txt files of RealEstate10K",
                 SourceKind::Dl3dv => "expected folders with a transforms.json",
                 _ => "expected folders with a transforms.json or a COLMAP model",
-            };
-            return Err(self.no_scenes(what, &others));
+            }));
         }
         report.num_scenes += without_cameras.len();
         for key in without_cameras {
             let lacks = if is_dl3dv_key(&key) { "transforms.json" } else { "cameras" };
             report.skip(key, format!("without {lacks}"));
         }
-        if !others.is_empty() {
-            report.notes.push(format!("not opened, other data sets: {}", first_few(&others)));
-        }
-        Ok(DetectedSource::Photos(kind, scenes, report))
+        Ok((kind, scenes, report))
     }
 
+    /// Returns the kind of scenes in folders. DL3DV differs in lenses, incomplete scenes and test scenes: one stray folder must
+    /// not decide the kind.
     fn recognise(&self, scenes: &[SceneFolder]) -> Result<SourceKind, DataError> {
-        if scenes.iter().all(|scene| matches!(scene.files, SceneFiles::Re10kText { .. })) {
-            return Ok(SourceKind::Re10kTxt);
-        }
-        // DL3DV differs in lenses, incomplete scenes and test scenes: one stray folder must not decide the kind.
+        let num_dl3dv = scenes.iter().filter(|scene| scene.is_dl3dv()).count();
         match scenes.iter().find(|scene| !scene.is_dl3dv()) {
             None => Ok(SourceKind::Dl3dv),
-            Some(other) if scenes.iter().any(SceneFolder::is_dl3dv) => {
-                let num_dl3dv = scenes.iter().filter(|scene| scene.is_dl3dv()).count();
+            Some(other) if num_dl3dv > 0 => {
                 let what = format!(
                     "{num_dl3dv} of {} scenes are DL3DV scenes by their names and transforms.json, and others, such as {}, \
                      are not: set data.source to \"dl3dv\" or \"captures\" for all scenes, or move them to separate \
@@ -156,7 +127,7 @@ impl<'a> SplitFolder<'a> {
     }
 
     /// Returns the error of a folder without scenes, with the data found instead.
-    fn no_scenes(&self, what: &str, others: &[String]) -> DataError {
+    fn no_scenes(&self, what: &str) -> DataError {
         let mut parts = vec![what.to_owned()];
         let folders = [self.base.as_path(), self.root.path.as_path()];
         let files = folders.into_iter().map(transforms_in).find(|files| !files.is_empty());
@@ -175,9 +146,6 @@ impl<'a> SplitFolder<'a> {
                  images --data PHOTOS --output-dir DIR`), then open DIR",
                 plural(num_photos, "image")
             ));
-        }
-        if !others.is_empty() {
-            parts.push(format!("other data sets below it, to be opened separately: {}", first_few(others)));
         }
         let path = if self.base.exists() { self.base.clone() } else { self.root.path.clone() };
         DataError::UnknownLayout { what: parts.join("; "), path }

@@ -5,18 +5,18 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::error::DataError;
-use crate::files::caches::cache_folder;
 use crate::files::listing::file_names;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
-use crate::sources::chunks::chunk_source::{ChunkSource, ScanProgress};
+use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::chunks::index::{index_of_files, note_unlisted, read_index};
 use crate::sources::chunks::index_cache::ChunkIndexCache;
-use crate::sources::dataset_root::{DatasetRoot, DetectedSource, SplitFolder};
+use crate::sources::chunks::table::ScanProgress;
+use crate::sources::dataset_root::{DatasetRoot, SplitFolder};
 use crate::sources::kind::SourceKind;
 use crate::sources::options::SourceOptions;
 use crate::sources::photos::photo::PhotoOptions;
-use crate::sources::photos::photo_source::{PhotoSource, PhotoSourceOptions};
+use crate::sources::photos::photo_source::PhotoSource;
 use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder};
 use crate::sources::subset::SceneSubset;
 use crate::sources::test_scenes::TestScenes;
@@ -52,7 +52,8 @@ impl OpenedSource {
 }
 
 /// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` if it has neither. `root` may be a data
-/// set, a single scene, or a `transforms.json` of any name.
+/// set, a single scene, or a `transforms.json` of any name. With filters, every chunk is read once: of a large data
+/// set the first opening can take a minute, in which `progress` is called.
 ///
 /// Without split folders both splits are the same scenes, unless
 /// [`FileOptions::test_scenes`](crate::sources::options::FileOptions::test_scenes) separates them.
@@ -60,13 +61,7 @@ impl OpenedSource {
 /// # Errors
 /// [`DataError::UnknownLayout`] for a folder without scenes, [`DataError::BadConfig`] for [`SourceKind::Synthetic`],
 /// and the errors of the reader of the layout.
-pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) -> Result<OpenedSource, DataError> {
-    scan_source(root, split, options, &mut |_, _| ())
-}
-
-/// Opens a data set as [`open_source`] does. `progress` is called while its chunks are examined for the filters: the first
-/// opening of a large data set reads every chunk and can take minutes.
-pub(crate) fn scan_source(
+pub fn open_source(
     root: &DatasetRoot,
     split: Split,
     options: &SourceOptions,
@@ -79,18 +74,14 @@ pub(crate) fn scan_source(
     // With an empty list, both splits are the same scenes.
     let list = list.filter(|list| list.num_scenes() > 0);
     let folder = SplitFolder::find(root, split)?;
-    let list = list.as_ref();
-    let (kind, (source, report)) = match folder.detect(options.kind)? {
-        DetectedSource::Torch(kind) => (kind, folder.open_torch(kind, options, list, progress)?),
-        DetectedSource::Photos(kind, scenes, report) => {
-            (kind, folder.open_photos(kind, scenes, report, options, list)?)
-        }
+    let (kind, scenes, mut report) = folder.detect(options.kind)?;
+    let source = if matches!(kind, SourceKind::Chunks | SourceKind::Scenes) {
+        folder.open_torch(kind, options, list.as_ref(), &mut report, progress)?
+    } else {
+        folder.open_photos(kind, scenes, options, list.as_ref(), &mut report)?
     };
     Ok(OpenedSource { source, kind, shares_scenes: !root.has_splits && list.is_none(), report })
 }
-
-/// A source with what it skipped.
-type Opened = (Arc<dyn SceneSource>, SkipReport);
 
 impl SplitFolder<'_> {
     fn open_torch(
@@ -98,65 +89,58 @@ impl SplitFolder<'_> {
         kind: SourceKind,
         options: &SourceOptions,
         list: Option<&TestScenes>,
+        report: &mut SkipReport,
         progress: ScanProgress<'_>,
-    ) -> Result<Opened, DataError> {
-        let mut report = SkipReport::default();
-        let index = if kind == SourceKind::Chunks {
+    ) -> Result<Arc<dyn SceneSource>, DataError> {
+        let mut index = if kind == SourceKind::Chunks {
             let index = read_index(&self.base.join("index.json"))?;
             report.notes.extend(note_unlisted(&self.base, &index)?);
             index
         } else {
-            index_of_files(&self.base, &mut report)?
+            index_of_files(&self.base, report, progress)?
         };
         let keys: Vec<String> = index.keys().cloned().collect();
-        let kept = self.divide(list, &keys, &mut report);
-        let kept: HashSet<&str> =
-            keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
-        let is_kept = |key: &str| kept.contains(key);
+        let mut kept = self.divide(list, &keys, report).into_iter();
+        index.retain(|_, _| kept.next().unwrap_or_default());
         let num_chunks = index.values().collect::<HashSet<_>>().len();
         let caches = cache_folder().filter(|_| num_chunks >= MIN_CACHED_CHUNKS);
         let cache = caches.map(|caches| ChunkIndexCache::path(&caches, &self.base));
-        let cache = cache.as_deref().map(|path| (path, progress));
         let (filters, reads_all) = (&options.filters, options.reads_chunks);
-        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, filters, reads_all, cache)?;
-        if kind == SourceKind::Chunks {
-            source.record_unlisted(&self.base, &index);
-        }
+        let source = ChunkSource::of_index(&self.base, &index, filters, reads_all, cache.as_deref(), progress)?;
         report.append(source.report.clone());
-        Ok((Arc::new(source), report))
+        Ok(Arc::new(source))
     }
 
     fn open_photos(
         &self,
         kind: SourceKind,
-        scenes: Vec<SceneFolder>,
-        mut report: SkipReport,
+        mut scenes: Vec<SceneFolder>,
         options: &SourceOptions,
         list: Option<&TestScenes>,
-    ) -> Result<Opened, DataError> {
-        let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
+        report: &mut SkipReport,
+    ) -> Result<Arc<dyn SceneSource>, DataError> {
+        if kind == SourceKind::Re10kTxt {
+            scenes = self.re10k_clips(options)?;
+        }
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
-        let mut kept = self.divide(list, &keys, &mut report).into_iter();
+        let mut kept = self.divide(list, &keys, report).into_iter();
         scenes.retain(|_| kept.next().unwrap_or_default());
         let is_dl3dv = kind == SourceKind::Dl3dv;
         let files = &options.files;
-        let source_options = PhotoSourceOptions {
-            photos: PhotoOptions {
-                image_folder: files.image_folder.clone(),
-                first_folders: if is_dl3dv { DL3DV_FOLDERS } else { &[] },
-                min_size: options.min_size,
-                poses_from: files.poses_from,
-                undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
-                background: options.background,
-            },
-            filters: options.filters.clone(),
-            whole_scenes: (is_dl3dv || kind == SourceKind::Re10kTxt) && !files.keep_incomplete,
+        let photos = PhotoOptions {
+            image_folder: files.image_folder.clone(),
+            first_folders: if is_dl3dv { DL3DV_FOLDERS } else { &[] },
+            undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
             min_size: options.min_size,
-            image_cache: options.image_cache.clone(),
+            background: options.background,
+            poses_from: files.poses_from,
+            filters: options.filters.clone(),
+            whole_scenes: is_dl3dv || kind == SourceKind::Re10kTxt,
+            caches_photos: options.caches_photos,
         };
-        let source = PhotoSource::open(scenes, &source_options)?;
+        let source = PhotoSource::open(scenes, &photos)?;
         report.append(source.report.clone());
-        Ok((Arc::new(source), report))
+        Ok(Arc::new(source))
     }
 
     /// Returns the clips of RealEstate10K as text files, with the folders of their frames.
@@ -191,4 +175,12 @@ impl SplitFolder<'_> {
         report.append(divided);
         kept
     }
+}
+
+/// Returns `clift` in the user's folder for caches; `None` if the environment has none.
+fn cache_folder() -> Option<PathBuf> {
+    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let home = || variable("HOME").map(|home| home.join(".cache"));
+    let caches = variable("XDG_CACHE_HOME").or_else(|| variable("LOCALAPPDATA")).or_else(home)?;
+    Some(caches.join("clift"))
 }

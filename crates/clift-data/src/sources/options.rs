@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
-use crate::sources::photos::image_cache::ImageCacheConfig;
 use crate::sources::photos::photo::PosesFrom;
 
 /// Paths of the parts of a layout, where they differ from the default.
@@ -24,9 +23,6 @@ pub struct FileOptions {
     /// Pixels from which the poses were computed, for photos with an EXIF orientation whose cameras fit both: `stored`, as by
     /// COLMAP, or `turned` by the orientation.
     pub poses_from: PosesFrom,
-    /// Whether scenes of `re10k_txt` and `dl3dv` with missing images are used without these frames. Frame indices then
-    /// differ from those of published evaluation indices.
-    pub keep_incomplete: bool,
 }
 
 /// Options of opening a data set on disk.
@@ -42,9 +38,8 @@ pub struct SourceOptions {
     pub background: [u8; 3],
     /// Smallest columns and rows of an image; for layouts with one file per frame.
     pub min_size: [usize; 2],
-    /// Cache of large photos at `min_size`; `None` decodes them at every use.
-    pub image_cache: Option<ImageCacheConfig>,
-    /// Whether every chunk is read even without filters, so that unreadable scenes and scenes missing from `index.json`
-    /// are reported.
+    /// Whether large photos, scaled to `min_size`, stay in memory after their first use.
+    pub caches_photos: bool,
+    /// Whether every chunk is read even without filters, so that unreadable scenes and frames are reported.
     pub reads_chunks: bool,
 }

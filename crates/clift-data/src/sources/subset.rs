@@ -62,35 +62,16 @@ impl SceneSubset {
         }
     }
 
-    fn has_all_frames(&self) -> bool {
-        match &self.left_out {
-            LeftOut::HeldOut(every) => *every == 0,
-            LeftOut::Frames(frames) => frames.is_empty(),
-        }
-    }
-
-    /// Returns the frames in the source of a scene of this subset.
-    fn kept_frames(&self, scene: usize) -> Result<Vec<usize>, DataError> {
-        let left_out = self.left_out(scene)?;
-        let all = 0..self.source.num_frames(self.scenes[scene])?;
-        Ok(all.filter(|frame| left_out.binary_search(frame).is_err()).collect())
-    }
-
     /// Returns the number of a kept frame in the source.
     fn frame_in_source(&self, scene: usize, frame: usize) -> Result<usize, DataError> {
-        if self.has_all_frames() {
-            return Ok(frame);
-        }
-        let kept = self.kept_frames(scene)?;
+        let all = (0..self.source.num_frames(self.scenes[scene])?).collect();
+        let kept: Vec<usize> = self.kept(scene, all)?;
         let (key, num_frames) = (self.key(scene), kept.len());
         kept.get(frame).copied().ok_or_else(|| DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames })
     }
 
     /// Keeps the values of the kept frames, of values for the frames in the source.
     fn kept<T>(&self, scene: usize, values: Vec<T>) -> Result<Vec<T>, DataError> {
-        if self.has_all_frames() {
-            return Ok(values);
-        }
         let left_out = self.left_out(scene)?;
         let kept = values.into_iter().enumerate().filter(|(frame, _)| left_out.binary_search(frame).is_err());
         Ok(kept.map(|(_, value)| value).collect())
@@ -116,14 +97,6 @@ impl SceneSource for SceneSubset {
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
         self.kept(scene, self.source.cameras(self.scenes[scene])?)
-    }
-
-    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        self.kept(scene, self.source.timestamps(self.scenes[scene])?)
-    }
-
-    fn url(&self, scene: usize) -> Result<String, DataError> {
-        self.source.url(self.scenes[scene])
     }
 
     fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
@@ -167,7 +140,10 @@ impl SceneSource for SceneSubset {
 mod tests {
     use super::*;
     use crate::scene_source::{Split, is_held_out};
-    use crate::testing::{TestSource, re10k_mini, rooms};
+    use crate::sources::chunks::chunk_source::ChunkSource;
+    use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+    use crate::sources::filters::SceneFilters;
+    use crate::testing::{re10k_mini, rooms};
 
     #[test]
     fn training_has_all_frames_but_the_held_out() {
@@ -196,11 +172,16 @@ mod tests {
         let source = Arc::new(re10k_mini(Split::Test));
         let (whole, bad) = SceneSubset::readable(source.clone(), 0).unwrap();
         assert!(bad.is_empty() && whole.num_scenes() == 1 && whole.key(0) == source.key(0));
-        let encoded = move |scene, frame| {
-            let bytes = re10k_mini(Split::Test).encoded_frame(scene, frame).unwrap();
-            if [0, 3].contains(&frame) { bytes.map(torn) } else { bytes }
+        let encoded = |frame| {
+            let bytes = source.encoded_frame(0, frame).unwrap().unwrap();
+            if [0, 3].contains(&frame) { torn(bytes) } else { bytes }
         };
-        let damaged = TestSource::new(re10k_mini(Split::Test)).with_encoded_frames(encoded);
+        let cameras = source.cameras(0).unwrap();
+        let images = (0..cameras.len()).map(encoded).collect();
+        let folder = tempfile::tempdir().unwrap();
+        let record = SceneRecord { key: source.key(0).into(), cameras, images };
+        write_chunks(&folder.path().join("test"), [Ok(record)], u64::MAX).unwrap();
+        let damaged = ChunkSource::open(folder.path(), Split::Test, &SceneFilters::default()).unwrap();
         let (readable, bad) = SceneSubset::readable(Arc::new(damaged), 0).unwrap();
         assert_eq!(bad.iter().map(|(frame, _)| *frame).collect::<Vec<_>>(), [0, 3]);
         assert!(bad[0].1.to_string().contains("image data"), "{}", bad[0].1);

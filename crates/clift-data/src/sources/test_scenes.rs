@@ -14,7 +14,7 @@ use crate::sources::keys::{last_name, plain_key};
 /// Largest size of a list, in bytes.
 const MAX_BYTES: u64 = 256 << 20;
 /// Reason of skipping a test scene in the training split; no fault of the scene.
-pub const KEPT_FOR_TESTING: &str = "kept for testing";
+pub(crate) const KEPT_FOR_TESTING: &str = "kept for testing";
 
 /// Keys of the test scenes, without the prefix of DepthSplat; for DL3DV scenes, without their path.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -102,33 +102,31 @@ mod tests {
     fn copies_of_test_scenes_are_kept_out_of_training() {
         let hash = "a".repeat(64);
         let keys = [format!("1K/{hash}"), format!("bench/{hash}"), "1K/attic".into(), "bench/attic".into()];
-        for listed in [hash.clone(), format!("11K/{hash}"), format!("dl3dv_{hash}")] {
-            let list = read(&listed).unwrap();
-            assert_eq!(list.divide(&keys, Split::Train, true).0, [false, false, true, true], "{listed}");
-            let (kept, report) = list.divide(&keys, Split::Test, true);
-            assert_eq!((kept, report.skips.len()), (vec![true, true, false, false], 0), "{listed}");
+        for (listed, kept) in [
+            (hash.clone(), [false, false, true, true]),
+            (format!("11K/{hash}"), [false, false, true, true]),
+            (format!("dl3dv_{hash}"), [false, false, true, true]),
+            // Captures of one name differ by their path; the name alone matches both.
+            ("1K/attic".into(), [true, true, false, true]),
+            ("attic".into(), [true, true, false, false]),
+        ] {
+            assert_eq!(read(&listed).unwrap().divide(&keys, Split::Train, true).0, kept, "{listed}");
         }
-        // Captures of one name differ by their path; the name alone matches both.
-        let kept = |listed: &str| read(listed).unwrap().divide(&keys, Split::Train, true).0;
-        assert_eq!(kept("1K/attic"), [true, true, false, true]);
-        assert_eq!(kept("attic"), [true, true, false, false]);
-        assert!(read("\u{feff}attic").unwrap().contains("attic"), "as an editor on Windows writes it");
     }
 
     #[test]
     fn training_and_test_scenes_are_disjoint() {
-        assert!(read("b c").unwrap().contains("b c"), "a line is a key");
-        let list = read("b\nc").unwrap();
+        let list = read("\u{feff}b\nc c").unwrap();
+        assert!(list.contains("c c"), "a line is a key");
         let keys = ["a", "dl3dv_b", "d"].map(String::from);
-        let divided = |split, is_shared| {
-            let (kept, report) = list.divide(&keys, split, is_shared);
-            (kept, report.to_string())
-        };
-        let train = (vec![true, false, true], "0 of 1 scenes used; 1 kept for testing".to_owned());
-        assert_eq!(divided(Split::Train, true), train);
-        assert_eq!(divided(Split::Train, false), train);
-        let absent = "0 of 1 scenes used; 1 in the list of test scenes, but not there".to_owned();
-        assert_eq!(divided(Split::Test, true), (vec![false, true, false], absent));
-        assert_eq!(divided(Split::Test, false), (vec![true; 3], "0 of 0 scenes used".to_owned()));
+        for (split, is_shared, kept, expected) in [
+            (Split::Train, true, [true, false, true], "0 of 1 scene used; 1 kept for testing"),
+            (Split::Train, false, [true, false, true], "0 of 1 scene used; 1 kept for testing"),
+            (Split::Test, true, [false, true, false], "0 of 1 scene used; 1 in the list of test scenes, but not there"),
+            (Split::Test, false, [true; 3], "0 scenes used"),
+        ] {
+            let (got, report) = list.divide(&keys, split, is_shared);
+            assert_eq!((got, report.to_string()), (kept.to_vec(), expected.to_owned()));
+        }
     }
 }

@@ -5,19 +5,8 @@ use serde::{Deserialize, Serialize};
 use crate::scene_source::Split;
 use clift_core::{BadConfig, check_config};
 
-/// Largest number of scenes of one source: the table of key blocks stays below 1 MiB.
-pub(crate) const MAX_SCENES: usize = 32_000_000;
-
-/// Viewing direction of the camera on its path.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LookDirection {
-    /// From near the walls towards the middle: all views show the same objects.
-    #[default]
-    In,
-    /// From near the middle towards the walls: views far apart on the path do not overlap.
-    Out,
-}
+/// Largest number of scenes of one source, whose keys take some 60 MB.
+const MAX_SCENES: usize = 1_000_000;
 
 /// Kind of synthetic scenes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -44,7 +33,7 @@ pub struct SyntheticConfig {
     pub seed: u64,
     /// Split, `"train"` or `"test"`. The splits share no scene, for any seed.
     pub split: Split,
-    /// Number of scenes, up to 32 million. Unused scenes cost nothing.
+    /// Number of scenes, up to a million. Unused scenes cost only their keys.
     pub num_scenes: usize,
     /// Number of frames along each camera path.
     pub num_frames: usize,
@@ -54,14 +43,7 @@ pub struct SyntheticConfig {
     pub height: usize,
     /// Horizontal field of view in degrees, up to 100. Pixels are square.
     pub fov_deg: f64,
-    /// Smallest and largest distance from the middle of a room to its walls; 1 or more.
-    pub room_half_size: [f64; 2],
-    /// Smallest and largest number of boxes and balls in a room; a crowded room may hold fewer.
-    pub num_objects: [usize; 2],
-    /// Viewing direction of the camera, `"in"` or `"out"`.
-    pub looks: LookDirection,
-    /// Length of the camera path from the first to the last frame, without small swings; longer is harder. A camera that
-    /// looks out rotates by the angle of this path.
+    /// Length of the camera path from the first to the last frame, without small swings; longer is harder.
     pub path_length: f64,
     /// Cycles of the wall patterns per unit of length; finer is harder. Patterns on objects are twice as fine.
     pub texture_frequency: f64,
@@ -84,9 +66,6 @@ impl Default for SyntheticConfig {
             width: 32,
             height: 32,
             fov_deg: 75.0,
-            room_half_size: [1.5, 2.0],
-            num_objects: [3, 5],
-            looks: LookDirection::In,
             path_length: 4.0,
             texture_frequency: 0.4,
             plain_share: 0.0,
@@ -107,17 +86,6 @@ impl SyntheticConfig {
         ] {
             check_config((1..=most).contains(&count), key, count, || format!("use 1 to {most}"))?;
         }
-        let [fewest, most] = self.num_objects;
-        check_config(fewest <= most && most <= 100, "num_objects", format!("[{fewest}, {most}]"), || {
-            "use [fewest, most] up to 100".into()
-        })?;
-        let [small, large] = self.room_half_size;
-        check_config(
-            small >= 1.0 && large >= small && large <= 100.0,
-            "room_half_size",
-            format!("[{small}, {large}]"),
-            || "use [smallest, largest] from 1 to 100".into(),
-        )?;
         for (key, value, low, high) in [
             ("fov_deg", self.fov_deg, 10.0, 100.0),
             ("path_length", self.path_length, 0.01, 1_000.0),
@@ -140,17 +108,7 @@ impl SyntheticConfig {
     /// Checks that no key is set that has a meaning for rooms only.
     fn check_unset(&self) -> Result<(), BadConfig> {
         let [own, unset] = [self, &Self::default()].map(|config| serde_json::to_value(config).unwrap_or_default());
-        for key in [
-            "fov_deg",
-            "room_half_size",
-            "num_objects",
-            "looks",
-            "path_length",
-            "texture_frequency",
-            "plain_share",
-            "specular",
-            "samples_per_pixel",
-        ] {
+        for key in ["fov_deg", "path_length", "texture_frequency", "plain_share", "specular", "samples_per_pixel"] {
             let fix = || "look = \"real\" does not use it: remove the key".into();
             check_config(own[key] == unset[key], key, &own[key], fix)?;
         }
@@ -165,25 +123,11 @@ mod tests {
     #[test]
     fn invalid_value_is_named_with_its_key() {
         type Change = fn(&mut SyntheticConfig);
-        let cases: [(Change, &str); 19] = [
+        let cases: [(Change, &str); 5] = [
             (|c| c.num_frames = 0, "`num_frames` = 0: use 1 to 100000"),
-            (|c| c.num_scenes = MAX_SCENES + 1, "`num_scenes` = 32000001"),
-            (|c| c.width = 0, "`width` = 0"),
-            (|c| c.height = 20_000, "`height` = 20000"),
+            (|c| c.num_scenes = MAX_SCENES + 1, "`num_scenes` = 1000001"),
             (|c| c.fov_deg = f64::NAN, "`fov_deg` = NaN"),
-            (|c| c.fov_deg = f64::INFINITY, "`fov_deg` = inf"),
-            (|c| c.room_half_size = [2.0, 1.0], "`room_half_size` = [2, 1]"),
-            (|c| c.room_half_size = [0.5, 1.0], "`room_half_size` = [0.5, 1]"),
-            (|c| c.room_half_size = [f64::NAN, 2.0], "`room_half_size` = [NaN, 2]"),
-            (|c| c.room_half_size = [1.5, f64::INFINITY], "`room_half_size` = [1.5, inf]"),
-            (|c| c.num_objects = [4, 2], "`num_objects` = [4, 2]"),
-            (|c| c.path_length = 0.0, "`path_length` = 0"),
             (|c| c.path_length = f64::INFINITY, "`path_length` = inf"),
-            (|c| c.texture_frequency = -1.0, "`texture_frequency` = -1"),
-            (|c| c.texture_frequency = f64::NAN, "`texture_frequency` = NaN"),
-            (|c| c.plain_share = 1.5, "`plain_share` = 1.5"),
-            (|c| c.specular = 1.5, "`specular` = 1.5"),
-            (|c| c.specular = f64::NEG_INFINITY, "`specular` = -inf"),
             (|c| c.samples_per_pixel = 6, "`samples_per_pixel` = 6"),
         ];
         for (change, expected) in cases {
@@ -192,13 +136,5 @@ mod tests {
             let message = config.validate().unwrap_err().to_string();
             assert!(message.starts_with(expected), "{message}");
         }
-    }
-
-    #[test]
-    fn keys_of_rooms_are_refused_for_the_other_look() {
-        let real: SyntheticConfig = serde_json::from_str(r#"{"look": "real", "num_frames": 32}"#).unwrap();
-        real.validate().unwrap();
-        let message = SyntheticConfig { fov_deg: 60.0, ..real }.validate().unwrap_err().to_string();
-        assert!(message.starts_with("`fov_deg` = 60.0: look = \"real\" does not use it"), "{message}");
     }
 }

@@ -14,9 +14,7 @@ use crate::synthetic::tracing::surface::Surface;
 const LEAST_SLOPE: f32 = 1e-6;
 /// Smallest weight of a mirrored ray; rays of smaller weight hardly change an 8-bit value.
 const LEAST_MIRROR: f32 = 0.02;
-/// Brightness of the ambient light.
 const AMBIENT: f32 = 0.6;
-/// Brightness of the lamp.
 const LAMP: f32 = 2.2;
 /// Distance over which the lamp's light halves, in units of length.
 const LAMP_REACH: f32 = 2.5;
@@ -73,7 +71,6 @@ fn display(light: Vec3) -> Vec3 {
     light.map(|x| (x * (1.0 + x * 0.1) / (1.0 + x * 0.45)).clamp(0.0, 1.0).sqrt())
 }
 
-/// Returns the linear light along a ray.
 fn trace(room: &Room, origin: Vec3, direction: Vec3, specular: f32, may_mirror: bool) -> Vec3 {
     let hit = nearest(room, origin, direction);
     let to_lamp = room.lamp - hit.point;
@@ -119,7 +116,6 @@ fn nearest(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     meet_room(room, origin, direction)
 }
 
-/// Returns the distance and the normal at which a ray from outside meets an object.
 fn meet(object: &Object, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)> {
     let from_center = origin - object.center;
     match object.shape {
@@ -177,7 +173,6 @@ fn coordinates(object: &Object, point: Vec3, normal: Vec3) -> [f32; 2] {
     }
 }
 
-/// Intersects a ray from inside the room with a wall.
 fn meet_room(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     let (mut distance, mut axis) = (f32::INFINITY, 0);
     for candidate in 0..3 {
@@ -254,101 +249,4 @@ fn lamp_glow(room: &Room, hit: &Hit) -> Vec3 {
     let across = hit.point - room.lamp;
     let squared = across.x.powi(2) + across.z.powi(2);
     Vec3::new(1.0, 0.95, 0.85) * (2.0 * smooth(1.5 - 12.0 * squared))
-}
-
-#[cfg(test)]
-mod tests {
-    use clift_core::step_rng;
-
-    use super::*;
-    use crate::synthetic::config::SyntheticConfig;
-
-    const RED: Vec3 = Vec3::new(1.0, 0.0, 0.0);
-
-    /// A room of one colour with one ball, and the default camera path.
-    fn room_with_ball(walls: Vec3, ball: Vec3, gloss: f32) -> Room {
-        let config = SyntheticConfig { num_objects: [0, 0], ..Default::default() };
-        let mut room = Room::sample(&mut step_rng(5, 0, "test"), &config);
-        room.walls = [(); 6].map(|()| Surface::plain(walls));
-        let shape = Shape::Ball { radius: 0.2 };
-        let center = Vec3::new(0.1, 0.2, -0.1);
-        room.objects.push(Object { shape, center, surface: Surface { gloss, ..Surface::plain(ball) } });
-        room
-    }
-
-    #[test]
-    fn ball_appears_at_its_projected_centre() {
-        let room = room_with_ball(Vec3::ZERO, RED, 0.0);
-        for time in [0.0, 0.2, 0.4, 0.6, 0.8, 1.0] {
-            let camera = room.path.camera(time, 75.0, 1.5);
-            let frame = render(&room, &camera, 192, 128, 1, 0.0);
-            let (mut sum, mut count) = ([0.0; 2], 0.0);
-            for (index, pixel) in frame.rgb.chunks_exact(3).enumerate() {
-                if pixel[0] > 30 && pixel[2] == 0 {
-                    sum[0] += (index % 192) as f64 + 0.5;
-                    sum[1] += (index / 192) as f64 + 0.5;
-                    count += 1.0;
-                }
-            }
-            let [x, y, depth] = camera.c2w.inverse().apply(room.objects[0].center.as_dvec3()).to_array();
-            let pixels = camera.intrinsics.to_pixels(192, 128);
-            let center = [pixels.fx * x / depth + pixels.cx, pixels.fy * y / depth + pixels.cy];
-            // The image of a ball off the axis is an ellipse whose middle lies outwards of the projected centre, by
-            // less than (radius / depth)^2 of the distance from the axis.
-            for (axis, middle) in [pixels.cx, pixels.cy].into_iter().enumerate() {
-                let off_axis = (center[axis] - middle).abs();
-                let tolerance = 0.3 + off_axis * (0.2 / depth).powi(2);
-                let got = sum[axis] / count;
-                assert!((got - center[axis]).abs() < tolerance, "axis {axis} at {time}: {got}, not {}", center[axis]);
-            }
-            let radius = pixels.fx * 0.2 / depth;
-            let area = std::f64::consts::PI * radius * radius;
-            assert!((0.95..1.35).contains(&(count / area)), "{count} pixels for a disc of {area}");
-        }
-    }
-
-    #[test]
-    fn floor_below_a_ball_is_in_shadow() {
-        let mut room = room_with_ball(Vec3::ONE, RED, 0.0);
-        let floor = room.half_size.y;
-        room.lamp = Vec3::new(0.1, -floor + 0.1, -0.1);
-        let light =
-            |room: &Room, x: f32| trace(room, Vec3::new(x, floor - 0.05, -0.1), Vec3::new(0.0, 1.0, 0.0), 0.0, true);
-        let (below, beside) = (light(&room, 0.1), light(&room, 0.9));
-        assert!(below.y < 0.5 * beside.y, "{below:?} {beside:?}");
-        room.objects.clear();
-        let (below, beside) = (light(&room, 0.1), light(&room, 0.9));
-        assert!(below.y > beside.y, "without the ball the floor is brightest below the lamp");
-    }
-
-    #[test]
-    fn only_specular_surfaces_depend_on_the_view() {
-        let room = room_with_ball(Vec3::new(0.2, 0.4, 0.8), RED, 1.0);
-        let ball = &room.objects[0];
-        let top = ball.center + Vec3::new(0.0, -0.2, 0.0);
-        let seen_from = |origin: Vec3, specular: f32| trace(&room, origin, (top - origin).normalize(), specular, true);
-        let (left, right) = (Vec3::new(-1.0, -0.6, 0.3), Vec3::new(0.9, -0.3, 0.2));
-        let difference = |specular: f32| (seen_from(left, specular) - seen_from(right, specular)).length();
-        assert!(difference(0.0) < 1e-4, "{}", difference(0.0));
-        assert!(difference(1.0) > 0.02, "{}", difference(1.0));
-    }
-
-    #[test]
-    fn turned_block_is_hit_at_its_faces() {
-        let turn = [0.6, 0.8];
-        let half_size = Vec3::new(0.3, 0.2, 0.1);
-        let shape = Shape::Block { half_size, turn };
-        let object = Object { shape, center: Vec3::new(1.0, 0.0, 2.0), surface: Surface::plain(RED) };
-        for axis in 0..3 {
-            let mut local = Vec3::ZERO;
-            local[axis] = 1.0;
-            let outwards = turned(local, [turn[0], -turn[1]]);
-            let (distance, normal) = meet(&object, object.center + outwards * 5.0, -outwards).unwrap();
-            assert!((distance - (5.0 - half_size[axis])).abs() < 1e-5, "axis {axis}: {distance}");
-            assert!((normal - outwards).length() < 1e-5, "axis {axis}: {normal:?}");
-        }
-        assert!(meet(&object, Vec3::new(0.0, 0.5, 0.0), Vec3::new(0.0, 0.0, 1.0)).is_none());
-        let behind = meet(&object, Vec3::new(1.0, 0.0, 4.0), Vec3::new(0.0, 0.0, 1.0));
-        assert!(behind.is_none(), "an object behind the origin is not hit");
-    }
 }

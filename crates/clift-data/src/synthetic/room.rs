@@ -1,16 +1,19 @@
-//! A room: box-shaped walls, boxes and balls on the floor, a lamp and a camera path.
+//! A room: box-shaped walls, boxes and balls on the floor, a lamp, and the camera's path: an arc around the middle of
+//! the room that faces a slowly moving point.
 
-use std::f32::consts::TAU;
+use std::f64::consts::TAU;
 
-use clift_core::{uniform_01, uniform_below, uniform_between};
-use glam::{DVec3, Vec3};
+use clift_core::{Camera, IntrinsicsNorm, Pose, uniform_01, uniform_below, uniform_between};
+use glam::{DMat3, DVec3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::synthetic::camera_path::{CLEARANCE, CameraPath};
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::tracing::surface::{Pattern, Surface, Wave, linear_color};
 
+/// Smallest and largest distance from the middle of a room to its walls.
+const HALF_SIZE: [f64; 2] = [1.5, 2.0];
+const NUM_OBJECTS: [usize; 2] = [3, 5];
 /// Attempts to place an object, each 4 % smaller, before the room counts as full.
 const MAX_PLACEMENTS: u32 = 60;
 
@@ -52,12 +55,12 @@ pub(crate) struct Room {
 impl Room {
     /// Samples a room. Expects a valid `config`.
     pub fn sample(rng: &mut ChaCha8Rng, config: &SyntheticConfig) -> Self {
-        let [small, large] = config.room_half_size;
+        let [small, large] = HALF_SIZE;
         let mut half = || small + (large - small) * uniform_01(rng);
         let (wide, deep) = (half(), half());
         let tall = small * (0.6 + 0.15 * uniform_01(rng));
         let half_size = DVec3::new(wide, tall, deep);
-        let path = CameraPath::sample(rng, half_size, config.path_length, config.looks);
+        let path = CameraPath::sample(rng, half_size, config.path_length);
         let lamp = DVec3::new(wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35));
         // Without plain rooms no random number is sampled: rooms equal those from before this option.
         let is_plain = config.plain_share > 0.0 && uniform_01(rng) < config.plain_share;
@@ -78,7 +81,7 @@ impl Room {
             Surface { gloss, ..sample_surface(rng, hue, saturation, value, frequency) }
         });
         let mut room = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
-        let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
+        let [fewest, most] = if is_plain { [0, 0] } else { NUM_OBJECTS };
         for _ in 0..uniform_between(rng, fewest, most) {
             let object = (0..MAX_PLACEMENTS).find_map(|attempt| room.try_object(rng, config, attempt));
             room.objects.extend(object);
@@ -88,10 +91,10 @@ impl Room {
 
     /// Samples an object on the floor. Returns `None` if the object touches the path, a wall or another object.
     fn try_object(&self, rng: &mut impl Rng, config: &SyntheticConfig, attempt: u32) -> Option<Object> {
-        let scale = config.room_half_size[0] * 0.96_f64.powi(attempt as i32);
+        let scale = HALF_SIZE[0] * 0.96_f64.powi(attempt as i32);
         let mut size = |low: f64, high: f64| (scale * (low + (high - low) * uniform_01(rng))) as f32;
         let (radius, edges) = (size(0.13, 0.26), [size(0.1, 0.2), size(0.1, 0.34), size(0.1, 0.2)]);
-        let (sin, cos) = (uniform_01(rng) as f32 * TAU).sin_cos();
+        let (sin, cos) = (uniform_01(rng) as f32 * std::f32::consts::TAU).sin_cos();
         let is_ball = uniform_01(rng) < 0.5;
         let (shape, height) = if is_ball {
             (Shape::Ball { radius }, radius)
@@ -109,7 +112,8 @@ impl Room {
     fn has_room_for(&self, object: &Object) -> bool {
         let (Vec3 { x, z, .. }, reach) = (object.center, object.reach());
         let from_axis = x.hypot(z);
-        let [nearest, farthest] = self.path.radius_bounds().map(|radius| radius as f32);
+        let swings = [1.0 - RADIUS_SWING, 1.0 + RADIUS_SWING];
+        let [nearest, farthest] = swings.map(|swing| (self.path.radius * swing) as f32);
         let clearance = CLEARANCE as f32;
         let off_path = from_axis + reach + clearance < nearest || from_axis - reach - clearance > farthest;
         let inside = x.abs() + reach < self.half_size.x && z.abs() + reach < self.half_size.z;
@@ -125,11 +129,11 @@ impl Room {
 /// describe the brighter colour.
 fn sample_surface(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Surface {
     let wave = [Wave::Gradient, Wave::Stripes, Wave::Checkers, Wave::Ripples][uniform_below(rng, 4)];
-    let turn = uniform_01(rng) * std::f64::consts::TAU;
+    let turn = uniform_01(rng) * TAU;
     let shift = 0.12 + 0.3 * uniform_01(rng);
     let darker = value * (0.25 + 0.15 * uniform_01(rng));
-    let rate = TAU * (frequency * (0.7 + 0.6 * uniform_01(rng))) as f32;
-    let phase = uniform_01(rng) as f32 * TAU;
+    let rate = std::f32::consts::TAU * (frequency * (0.7 + 0.6 * uniform_01(rng))) as f32;
+    let phase = uniform_01(rng) as f32 * std::f32::consts::TAU;
     let mut surface = Surface::plain(linear_color(hue, saturation, value));
     surface.colors[1] = linear_color(hue + shift, saturation, darker);
     Surface { pattern: Pattern::Waves { wave, phase }, turn: [turn.cos() as f32, turn.sin() as f32], rate, ..surface }
@@ -145,98 +149,70 @@ fn swing(rng: &mut impl Rng, size: f64) -> f64 {
     size * (2.0 * uniform_01(rng) - 1.0)
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::synthetic::config::LookDirection;
-    use clift_core::step_rng;
+/// Smallest distance between the camera and any surface, in the scene's units of length.
+pub(crate) const CLEARANCE: f64 = 0.25;
 
-    /// Returns the distance from a point to the surface of an object, 0 inside.
-    fn distance(object: &Object, point: Vec3) -> f32 {
-        let from_center = point - object.center;
-        match object.shape {
-            Shape::Ball { radius } => (from_center.length() - radius).max(0.0),
-            Shape::Block { half_size, turn } => (turned(from_center, turn).abs() - half_size).max(Vec3::ZERO).length(),
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct CameraPath {
+    radius: f64,
+    start: f64,
+    sweep: f64,
+    /// Mean height of the camera relative to the room's middle, downwards, and the amplitude of its swing.
+    height: [f64; 2],
+    /// Mean fixated point, and the amplitude of its swing.
+    target: [DVec3; 2],
+    phase: f64,
+}
+
+/// Amplitude of the radius over its mean.
+const RADIUS_SWING: f64 = 0.06;
+
+impl CameraPath {
+    /// Samples a path of about `length` in a room of `half_size` (y is down).
+    pub fn sample(rng: &mut impl Rng, half_size: DVec3, length: f64) -> Self {
+        let radius = (half_size.x.min(half_size.z) - CLEARANCE) * (0.86 + 0.08 * uniform_01(rng));
+        let side = if uniform_01(rng) < 0.5 { -1.0 } else { 1.0 };
+        let tall = half_size.y;
+        let mut around = |size: f64| (2.0 * uniform_01(rng) - 1.0) * size;
+        let height = [tall * (-0.15 + around(0.2)), around(0.15 * tall)];
+        // At most 0.6 of the radius from the axis: the camera never reaches its fixated point.
+        let target = DVec3::new(around(0.1 * radius), tall * (0.2 + around(0.15)), around(0.1 * radius));
+        let (sin, cos) = around(0.5 * TAU).sin_cos();
+        let pan = radius * (0.35 + around(0.1));
+        let drift = DVec3::new(pan * cos, around(0.3 * tall), pan * sin);
+        Self {
+            radius,
+            start: uniform_01(rng) * TAU,
+            sweep: side * length / radius,
+            height,
+            target: [target, drift],
+            phase: uniform_01(rng) * TAU,
         }
     }
 
-    fn rooms(config: &SyntheticConfig) -> Vec<Room> {
-        (0..200).map(|index| Room::sample(&mut step_rng(3, index, "test"), config)).collect()
+    pub fn position(&self, time: f64) -> DVec3 {
+        let (sin, cos) = (self.start + self.sweep * time).sin_cos();
+        let radius = self.radius * (1.0 + RADIUS_SWING * (TAU * time + self.phase).sin());
+        let height = self.height[0] + self.height[1] * (0.5 * TAU * time + self.phase).sin();
+        DVec3::new(radius * cos, height, radius * sin)
     }
 
-    #[test]
-    fn camera_stays_clear_of_walls_and_objects() {
-        // The room is in f32, the path in f64: 1e-5 covers the difference.
-        let least = CLEARANCE as f32 - 1e-5;
-        let crowded = SyntheticConfig {
-            room_half_size: [1.0, 3.0],
-            num_objects: [20, 30],
-            path_length: 20.0,
-            ..Default::default()
-        };
-        let turning = SyntheticConfig { looks: LookDirection::Out, ..crowded.clone() };
-        for config in [SyntheticConfig::default(), crowded, turning] {
-            for room in rooms(&config) {
-                for time in 0..=500 {
-                    let position = room.path.position(f64::from(time) / 500.0).as_vec3();
-                    let to_walls = room.half_size - position.abs();
-                    assert!(to_walls.min_element() > least, "{position} in {}", room.half_size);
-                    for object in &room.objects {
-                        let apart = distance(object, position);
-                        assert!(apart > least, "{apart} from {object:?}");
-                    }
-                }
-            }
+    /// Returns an upright camera with square pixels and a horizontal field of view of `fov_deg` degrees.
+    pub fn camera(&self, time: f64, fov_deg: f64, aspect: f64) -> Camera<IntrinsicsNorm> {
+        let position = self.position(time);
+        let swing = (TAU * time + self.phase).cos();
+        let [target, drift] = self.target;
+        let forward = unit_vector(target + swing * drift - position);
+        let right = unit_vector(DVec3::Y.cross(forward));
+        let fx = 0.5 / (0.5 * fov_deg.to_radians()).tan();
+        Camera {
+            intrinsics: IntrinsicsNorm { fx, fy: fx * aspect, cx: 0.5, cy: 0.5 },
+            c2w: Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: position },
         }
     }
+}
 
-    #[test]
-    fn objects_stand_apart_on_the_floor() {
-        for room in rooms(&SyntheticConfig::default()) {
-            for (i, object) in room.objects.iter().enumerate() {
-                let height = match object.shape {
-                    Shape::Ball { radius } => radius,
-                    Shape::Block { half_size, .. } => half_size.y,
-                };
-                assert!((object.center.y + height - room.half_size.y).abs() < 1e-5);
-                assert!([0, 2].iter().all(|&axis| object.center[axis].abs() + object.reach() < room.half_size[axis]));
-                for other in &room.objects[i + 1..] {
-                    let Vec3 { x, z, .. } = object.center - other.center;
-                    assert!(x.hypot(z) > object.reach() + other.reach());
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn camera_that_looks_out_faces_away_from_the_middle() {
-        for looks in [LookDirection::In, LookDirection::Out] {
-            for room in rooms(&SyntheticConfig { looks, ..Default::default() }) {
-                for time in [0.0, 0.3, 1.0] {
-                    let camera = room.path.camera(time, 75.0, 1.0).c2w;
-                    let (forward, centre) = (camera.rotation.z_axis, camera.translation);
-                    let away = forward.x * centre.x + forward.z * centre.z;
-                    assert_eq!(away > 0.0, looks == LookDirection::Out, "{forward} at {centre}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn plain_share_sets_the_number_of_empty_rooms() {
-        let plain = |plain_share| {
-            let config = SyntheticConfig { plain_share, ..Default::default() };
-            rooms(&config).iter().filter(|room| room.objects.is_empty()).count()
-        };
-        assert_eq!((plain(0.0), plain(1.0)), (0, 200));
-        // Four standard deviations of 200 samples: 28.
-        assert!((72..=128).contains(&plain(0.5)), "{}", plain(0.5));
-    }
-
-    #[test]
-    fn default_rooms_have_the_configured_number_of_objects() {
-        let counts: Vec<usize> = rooms(&SyntheticConfig::default()).iter().map(|room| room.objects.len()).collect();
-        assert!(counts.iter().all(|count| (3..=5).contains(count)), "{counts:?}");
-        assert!([3, 4, 5].iter().all(|count| counts.contains(count)));
-    }
+/// Normalises a vector other than zero. [`DVec3::normalize`] multiplies by the reciprocal, which would change rooms.
+fn unit_vector(v: DVec3) -> DVec3 {
+    v / v.length()
 }

@@ -10,10 +10,9 @@ use crate::error::DataError;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkippedScene;
 
-/// Largest number of scenes whose image size is read.
 const MAX_SIZED_SCENES: usize = 1000;
 
-/// Summary of a source. The optional fields are `None` for a source without scenes.
+/// Summary of a source. The optional fields are `None` for a source without readable scenes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SourceInfo {
     /// Number of scenes.
@@ -33,54 +32,38 @@ pub struct SourceInfo {
 
 impl SourceInfo {
     /// Reads the cameras of every scene and the size of a frame, on all cores.
-    pub fn read(source: &dyn SceneSource) -> Result<Self, DataError> {
-        let every = source.num_scenes().div_ceil(MAX_SIZED_SCENES).max(1);
-        let read = (0..source.num_scenes()).into_par_iter().map(|scene| {
+    pub fn read(source: &dyn SceneSource) -> Self {
+        let num_scenes = source.num_scenes();
+        let every = num_scenes.div_ceil(MAX_SIZED_SCENES).max(1);
+        let read = |scene: usize| {
             let cameras = source.cameras(scene)?;
-            let fov_deg: Vec<f64> = cameras.iter().map(Camera::fov_deg).map(|(x, y)| x.max(y)).collect();
-            let is_sized = scene % every == 0 && !cameras.is_empty();
-            let size = is_sized.then(|| source.image_size(scene, 0)).transpose();
-            Ok((cameras.len(), fov_deg, extent(&cameras), size))
-        });
-        let read: Vec<Result<_, DataError>> = read.collect();
-        let (mut scenes, mut unreadable, mut first_error) = (Vec::new(), Vec::new(), None);
-        let mut image_sizes = BTreeMap::new();
+            let is_sized = scene.is_multiple_of(every) && !cameras.is_empty();
+            let size = if is_sized { Some(source.image_size(scene, 0)?) } else { None };
+            Ok((cameras, size))
+        };
+        let read: Vec<Result<_, DataError>> = (0..num_scenes).into_par_iter().map(read).collect();
+        let (mut lengths, mut fields, mut extents) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut image_sizes, mut unreadable) = (BTreeMap::new(), Vec::new());
         for (scene, found) in read.into_iter().enumerate() {
-            let mut fail = |error: DataError| {
-                unreadable.push(SkippedScene { key: source.key(scene).to_owned(), reason: error.to_string() });
-                first_error.get_or_insert(error);
-            };
             match found {
-                Ok((num_frames, fov_deg, extent, size)) => {
-                    if let Some([width, height]) = size.unwrap_or_else(|error| {
-                        fail(error);
-                        None
-                    }) {
+                Ok((cameras, size)) => {
+                    lengths.push(cameras.len() as f64);
+                    fields.extend(cameras.iter().map(Camera::fov_deg).map(|(x, y)| x.max(y)));
+                    extents.push(extent(&cameras));
+                    if let Some([width, height]) = size {
                         *image_sizes.entry(format!("{width}x{height}")).or_insert(0) += 1;
                     }
-                    scenes.push((num_frames, fov_deg, extent));
                 }
-                Err(error) => fail(error),
+                Err(error) => {
+                    unreadable.push(SkippedScene { key: source.key(scene).to_owned(), reason: error.to_string() });
+                }
             }
         }
-        if let (true, Some(error)) = (scenes.is_empty(), first_error) {
-            return Err(error);
-        }
-        let lengths: Vec<f64> = scenes.iter().map(|(num_frames, ..)| *num_frames as f64).collect();
-        let fields: Vec<f64> = scenes.iter().flat_map(|(_, fov_deg, _)| fov_deg).copied().collect();
-        let extents: Vec<f64> = scenes.iter().map(|(.., extent)| *extent).collect();
-        Ok(Self {
-            num_scenes: source.num_scenes(),
-            num_frames: MinMedianMax::of(&lengths),
-            image_sizes,
-            fov_deg: MinMedianMax::of(&fields),
-            extent: MinMedianMax::of(&extents),
-            unreadable,
-        })
+        let [num_frames, fov_deg, extent] = [lengths, fields, extents].map(|values| MinMedianMax::of(&values));
+        Self { num_scenes, num_frames, image_sizes, fov_deg, extent, unreadable }
     }
 }
 
-/// Returns the largest distance of a camera centre from the mean centre along a world axis.
 fn extent(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
     let count = cameras.len() as f64;
     let mean: DVec3 = cameras.iter().map(|camera| camera.c2w.translation / count).sum();
@@ -90,37 +73,17 @@ fn extent(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene_source::Split;
-    use crate::sources::chunks::chunk_source::ChunkSource;
-    use crate::sources::filters::SceneFilters;
-    use crate::testing::{fixture, re10k_mini};
-
-    fn sizes(num_scenes: usize) -> BTreeMap<String, usize> {
-        BTreeMap::from([("64x36".into(), num_scenes)])
-    }
+    use crate::testing::{TestSource, rooms};
 
     #[test]
     fn unreadable_scene_is_named_and_the_others_are_summarised() {
-        let root = tempfile::tempdir().unwrap();
-        let train = root.path().join("train");
-        std::fs::create_dir(&train).unwrap();
-        std::fs::copy(fixture("re10k-mini/train/000000.torch"), train.join("000000.torch")).unwrap();
-        let index = r#"{"00000000000000a1": "000000.torch", "elsewhere": "000000.torch"}"#;
-        std::fs::write(train.join("index.json"), index).unwrap();
-        let source = ChunkSource::open(root.path(), Split::Train, &SceneFilters::default()).unwrap();
-        let info = SourceInfo::read(&source).unwrap();
-        assert_eq!((&info.image_sizes, info.num_frames.map(|frames| frames.max)), (&sizes(1), Some(8.0)));
-        assert_eq!((info.unreadable.len(), info.unreadable[0].key.as_str()), (1, "elsewhere"));
-        assert!(info.unreadable[0].reason.contains("expected scene elsewhere"), "{info:?}");
-    }
-
-    #[test]
-    fn summary_of_the_fixture_matches_values_by_hand() {
-        let info = SourceInfo::read(&re10k_mini(Split::Train)).unwrap();
-        assert_eq!((info.num_scenes, info.image_sizes), (2, sizes(2)));
+        let broken = || DataError::bad_camera("the pose holds NaN".into());
+        let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (3, 8)))
+            .with_cameras(move |base, scene| if scene == 1 { Err(broken()) } else { base.cameras(scene) });
+        let info = SourceInfo::read(&source);
+        assert_eq!((info.num_scenes, info.image_sizes), (3, BTreeMap::from([("32x32".into(), 2)])));
         assert_eq!(info.num_frames, Some(MinMedianMax { min: 8.0, median: 8.0, max: 8.0 }));
-        // 2 atan(0.5 / 0.9) = 58.1 degrees; centres are 0, 0.1, .., 0.7 along x, up to 0.35 from the mean.
-        assert_eq!(format!("{:.1}", info.fov_deg.unwrap()), "58.1 / 58.1 / 58.1");
-        assert_eq!(format!("{:.3}", info.extent.unwrap()), "0.350 / 0.350 / 0.350");
+        let reason = "bad camera: the pose holds NaN".into();
+        assert_eq!(info.unreadable, [SkippedScene { key: source.key(1).into(), reason }]);
     }
 }

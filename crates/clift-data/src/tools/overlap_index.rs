@@ -8,7 +8,6 @@ use clift_core::{
     uniform_between,
 };
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::geometry::overlap::overlap;
@@ -19,7 +18,7 @@ use crate::tools::export::write_index;
 
 /// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts, except
 /// that no target is a context.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug)]
 pub struct OverlapOptions {
     /// Number of context frames per scene, at least 2.
     pub num_context: usize,
@@ -29,22 +28,13 @@ pub struct OverlapOptions {
     pub distance: [usize; 2],
     /// Smallest [`overlap`] of the first and the last context, in both directions.
     pub min_overlap: f64,
-    /// Whether a target may also be a context, as in the published index. The input holds the image of such a target.
-    pub context_targets: bool,
     /// Seed of the selection among the possible frames.
     pub seed: u64,
 }
 
 impl Default for OverlapOptions {
     fn default() -> Self {
-        Self {
-            num_context: 4,
-            num_targets: 3,
-            distance: [45, 135],
-            min_overlap: 0.6,
-            context_targets: false,
-            seed: 123,
-        }
+        Self { num_context: 4, num_targets: 3, distance: [45, 135], min_overlap: 0.6, seed: 123 }
     }
 }
 
@@ -53,19 +43,14 @@ impl OverlapOptions {
     pub fn validate(&self) -> Result<(), BadConfig> {
         let Self { num_context, num_targets, distance: [near, far], min_overlap, .. } = *self;
         check_config((2..=10_000).contains(&num_context), "num_context", num_context, || "use 2 or more".into())?;
-        let least = num_context - usize::from(self.context_targets);
         let distance = format!("{near} to {far}");
         check_config(far >= near, "distance", &distance, || "write the smaller number first".into())?;
-        check_config(near >= least, "distance", distance, || {
-            format!("{num_context} contexts and a target need a gap of {least} or more")
+        check_config(near >= num_context, "distance", distance, || {
+            format!("{num_context} contexts and a target need a gap of {num_context} or more")
         })?;
-        let (most, frames) = if self.context_targets {
-            (near + 1, "the frames of the smallest gap")
-        } else {
-            (near + 1 - num_context, "the frames of the smallest gap that are not context views")
-        };
+        let most = near + 1 - num_context;
         check_config((1..=most).contains(&num_targets), "num_targets", num_targets, || {
-            format!("use 1 to {most}, {frames}")
+            format!("use 1 to {most}, the frames of the smallest gap that are not context views")
         })?;
         check_config((0.0..=1.0).contains(&min_overlap), "min_overlap", min_overlap, || "use 0 to 1".into())
     }
@@ -99,7 +84,7 @@ impl OverlapOptions {
             let inner = sample_distinct(&mut rng, right - left - 1, self.num_context - 2);
             let inner = inner.into_iter().map(|offset| left + 1 + offset);
             let context: Vec<usize> = [left].into_iter().chain(inner).chain([right]).collect();
-            let candidates = (left..=right).filter(|frame| self.context_targets || !context.contains(frame));
+            let candidates = (left..=right).filter(|frame| !context.contains(frame));
             let mut target = sample_from(&mut rng, candidates.collect(), self.num_targets);
             target.sort_unstable();
             return Ok(ViewIndices { context, target });
@@ -151,28 +136,20 @@ pub fn write_overlap_index(
 mod tests {
     use super::*;
     use crate::sampling::evaluation_index::EvaluationIndex;
-    use crate::synthetic::source::SyntheticSource;
-    use crate::testing::{self, TestSource};
-    use clift_core::Pose;
-    use glam::DMat3;
-
-    fn rooms(num_scenes: usize) -> SyntheticSource {
-        testing::rooms(|c| (c.num_scenes, c.num_frames, c.path_length) = (num_scenes, 60, 3.0))
-    }
-
-    fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, SkipReport) {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        let report = write_overlap_index(&path, &[source], options).unwrap();
-        (EvaluationIndex::read(&path).unwrap(), report)
-    }
+    use crate::testing;
 
     #[test]
     fn every_pair_overlaps_at_an_allowed_distance() {
-        let source = rooms(20);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        let source = testing::rooms(|c| (c.num_scenes, c.num_frames, c.path_length) = (20, 60, 3.0));
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let (written, report) = index(&source, &options);
-        let (items, _) = written.select(&source, 0);
+        let short = testing::rooms(|c| (c.num_scenes, c.num_frames) = (20, 40));
+        let report = write_overlap_index(&path, &[&short], &OverlapOptions::default()).unwrap();
+        assert_eq!(report.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
+        assert!(!path.exists());
+        let report = write_overlap_index(&path, &[&source], &options).unwrap();
+        let (items, _) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
         assert!(items.len() > 10 && items.len() == report.num_used(), "{report}");
         let mut spans = Vec::new();
         for item in &items {
@@ -187,76 +164,9 @@ mod tests {
             assert!(overlap(a, b) >= 0.6 && overlap(b, a) >= 0.6);
             spans.push(right - left);
         }
-        let published = index(&source, &OverlapOptions { context_targets: true, ..options }).0;
-        assert!(published.usable().any(|(_, views)| views.num_context_targets() > 0));
         spans.sort_unstable();
         assert!(spans[0] < spans[spans.len() - 1], "not always the nearest: {spans:?}");
-    }
-
-    #[test]
-    fn scenes_without_views_are_null_and_reported() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        let short = testing::rooms(|c| (c.num_scenes, c.num_frames) = (20, 40));
-        let report = write_overlap_index(&path, &[&short], &OverlapOptions::default()).unwrap();
-        assert_eq!(report.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
-        assert!(!path.exists(), "an index without views");
-        let (written, report) = index(&first_is_short(rooms(20)), &OverlapOptions::default());
-        assert_eq!((written.num_keys(), written.usable().count()), (20, 19));
-        assert_eq!(report.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
-    }
-
-    fn first_is_short(rooms: SyntheticSource) -> TestSource {
-        TestSource::new(rooms).with_cameras(|scene, mut cameras| {
-            cameras.truncate(if scene == 0 { 10 } else { usize::MAX });
-            Ok(cameras)
-        })
-    }
-
-    #[test]
-    fn turning_camera_has_only_pairs_with_overlap() {
-        // 75 degrees wide, three degrees per frame: half of the view is left after some 12 frames, nothing after 25.
-        let intrinsics_norm = IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
-        let camera = |frame: usize| {
-            let rotation = DMat3::from_rotation_y((3.0 * frame as f64).to_radians());
-            Camera { intrinsics: intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
-        };
-        let cameras: Vec<Camera<IntrinsicsNorm>> = (0..60).map(camera).collect();
-        let options = |near, far| OverlapOptions { num_targets: 1, distance: [near, far], ..OverlapOptions::default() };
-        for key in ["a", "b", "c", "d", "e", "f"] {
-            let ViewIndices { context, .. } = options(4, 50).sample_views(key, &cameras).unwrap();
-            assert!((4..=12).contains(&(context[3] - context[0])), "{context:?}");
-        }
-        let reason = options(20, 50).sample_views("a", &cameras).unwrap_err();
-        assert_eq!(reason, "without two frames 20 to 50 apart that overlap by 0.6");
-    }
-
-    #[test]
-    fn views_do_not_depend_on_other_scenes() {
-        let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let views = |source: &SyntheticSource, options: &OverlapOptions| {
-            index(source, options).0.usable().map(|(key, views)| (key.to_owned(), views.clone())).collect::<Vec<_>>()
-        };
-        let all = views(&rooms(20), &options);
-        assert_eq!(all, views(&rooms(20), &options));
-        let fewer = views(&rooms(5), &options);
-        assert_eq!(fewer[..], all[..fewer.len()]);
-        assert_ne!(all, views(&rooms(20), &OverlapOptions { seed: 5, ..options }));
-    }
-
-    #[test]
-    fn index_of_two_splits_has_all_scenes_and_refuses_shared_ones() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let other = testing::rooms(|c| (c.seed, c.num_scenes, c.num_frames, c.path_length) = (1, 3, 60, 3.0));
-        let report = write_overlap_index(&path, &[&rooms(20), &other], &options).unwrap();
-        let written = EvaluationIndex::read(&path).unwrap();
-        assert_eq!((report.num_scenes, written.num_keys()), (23, 23));
-        let alone = index(&other, &options).0;
-        let of_other = written.usable().filter(|(key, _)| other.find(key).is_some());
-        assert!(of_other.eq(alone.usable()));
-        let message = write_overlap_index(&path, &[&other, &other], &options).unwrap_err().to_string();
+        let message = write_overlap_index(&path, &[&source, &source], &options).unwrap_err().to_string();
         assert!(message.contains("-00000 is in both splits; make one index per split"), "{message}");
     }
 
@@ -267,11 +177,7 @@ mod tests {
             (OverlapOptions { num_context: 1, ..valid() }, "`num_context` = 1"),
             (OverlapOptions { num_targets: 0, ..valid() }, "`num_targets` = 0"),
             (OverlapOptions { num_targets: 43, ..valid() }, "`num_targets` = 43: use 1 to 42, "),
-            (OverlapOptions { num_targets: 47, ..valid() }, "`num_targets` = 47"),
-            (
-                OverlapOptions { distance: [2, 9], ..valid() },
-                "`distance` = 2 to 9: 4 contexts and a target need a gap of 4 or more",
-            ),
+            (OverlapOptions { distance: [2, 9], ..valid() }, "`distance` = 2 to 9: 4 contexts and a target need"),
             (OverlapOptions { distance: [9, 8], ..valid() }, "`distance` = 9 to 8"),
             (OverlapOptions { min_overlap: f64::NAN, ..valid() }, "`min_overlap` = NaN"),
         ] {

@@ -1,4 +1,4 @@
-//! The ZIP archive of `torch.save`. Its members are uncompressed, so that each can be read on its own.
+//! The ZIP archive of `torch.save`. Its members are uncompressed, so that each can be read on its own; byte ranges of tensors.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -9,7 +9,7 @@ use zip::{CompressionMethod, ZipArchive};
 
 use crate::error::DataError;
 use crate::torch::file_kind::{other_format, require_file};
-use crate::torch::values::MAX_BYTES;
+use crate::torch::values::{ElementType, MAX_BYTES, Tensor, Value};
 
 /// Byte range of a member of an archive, or of a part of a member. It takes 24 bytes, because a data set has millions.
 #[derive(Clone, Copy, Debug)]
@@ -17,12 +17,10 @@ pub(crate) struct ByteSpan {
     /// Start of the member's local header in the file. The start of its data is read from the header on use: reading all
     /// headers at opening would touch every page of every chunk.
     header_start: u64,
-    /// First byte within the member.
     start: u32,
     length: u32,
-    /// Checksum of the whole member; not used for a part.
+    /// Checksum of the whole member; 0 for a part, and where checksums are switched off.
     crc32: u32,
-    is_whole: bool,
 }
 
 impl ByteSpan {
@@ -30,18 +28,13 @@ impl ByteSpan {
         u64::from(self.length)
     }
 
-    /// Returns the part of `length` bytes from `start`; `None` if it exceeds the member.
+    /// Returns the part of `length` bytes from `start` of a whole member; `None` if it exceeds the member.
     pub fn part(self, start: u64, length: u64) -> Option<Self> {
         if start == 0 && length == self.len() {
             return Some(self);
         }
         let end = start.checked_add(length)?;
-        (self.is_whole && end <= self.len()).then_some(Self {
-            start: start as u32,
-            length: length as u32,
-            is_whole: false,
-            ..self
-        })
+        (end <= self.len()).then_some(Self { start: start as u32, length: length as u32, crc32: 0, ..self })
     }
 
     pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
@@ -62,8 +55,7 @@ impl ByteSpan {
         // Bounded by the size of the file: `Archive::open` checks the length.
         let mut bytes = vec![0; self.length as usize];
         file.read_exact(&mut bytes).map_err(|_| bad("lies behind the end of the file"))?;
-        // 0 is written where checksums are switched off.
-        if self.is_whole && self.crc32 != 0 && crc32fast::hash(&bytes) != self.crc32 {
+        if self.crc32 != 0 && crc32fast::hash(&bytes) != self.crc32 {
             return Err(bad("has another checksum than the directory of the archive"));
         }
         Ok(bytes)
@@ -99,8 +91,7 @@ impl Archive {
             if entry.header_start().saturating_add(entry.size()) > file_bytes {
                 return Err(bad(format!("member {name} lies behind the end of the file")));
             }
-            let span =
-                ByteSpan { header_start: entry.header_start(), start: 0, length, crc32: entry.crc32(), is_whole: true };
+            let span = ByteSpan { header_start: entry.header_start(), start: 0, length, crc32: entry.crc32() };
             members.insert(name.to_owned(), span);
         }
         let archive = Self { members };
@@ -113,7 +104,6 @@ impl Archive {
         Ok(archive)
     }
 
-    /// Reads the pickle of the archive at `path`, the member `data.pkl`.
     pub fn read_pickle(&self, path: &Path) -> Result<Vec<u8>, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let member = self
@@ -130,8 +120,48 @@ impl Archive {
         self.members.values().all(|member| member.crc32 == 0)
     }
 
-    /// Returns a member by its name without the top folder.
     pub fn member(&self, name: &str) -> Option<ByteSpan> {
         self.members.get(name).copied()
     }
+}
+
+/// Returns the byte range of a tensor, after checks of type, shape (`None` is any size), layout and bounds.
+pub(crate) fn tensor_span(
+    value: &Value,
+    shape: &[Option<u64>],
+    element_types: &[ElementType],
+    archive: &Archive,
+) -> Result<(ByteSpan, ElementType), String> {
+    let Value::Tensor(tensor) = value else { return Err("no tensor".into()) };
+    let Tensor { storage, offset, .. } = &**tensor;
+    let element_type = storage.element_type;
+    if !element_types.contains(&element_type) {
+        return Err(format!("elements are {element_type:?}, expected one of {element_types:?}"));
+    }
+    let matches = tensor.shape.len() == shape.len()
+        && tensor.shape.iter().zip(shape).all(|(got, expected)| expected.is_none_or(|expected| *got == expected));
+    if !matches {
+        let expected: Vec<_> = shape.iter().map(|size| size.map_or("any".into(), |size| size.to_string())).collect();
+        return Err(format!("shape is {:?}, expected [{}]", tensor.shape, expected.join(", ")));
+    }
+    if !tensor.is_contiguous() {
+        return Err(format!(
+            "stride is {:?}, expected a contiguous tensor; save it as tensor.contiguous()",
+            tensor.stride
+        ));
+    }
+    let member = archive
+        .member(&format!("data/{}", storage.key))
+        .ok_or_else(|| format!("its storage data/{} is not in the archive", storage.key))?;
+    let size = element_type.num_bytes();
+    let span = tensor
+        .shape
+        .iter()
+        .try_fold(size, |product, size| product.checked_mul(*size))
+        .zip(offset.checked_mul(size))
+        .and_then(|(length, start)| member.part(start, length))
+        .ok_or_else(|| {
+            format!("shape {:?} at offset {offset} exceeds its storage of {} bytes", tensor.shape, member.len())
+        })?;
+    Ok((span, element_type))
 }

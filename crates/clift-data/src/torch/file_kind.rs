@@ -5,14 +5,11 @@ use std::path::Path;
 use crate::error::DataError;
 use crate::files::bounded::read_start;
 
-/// Number of bytes read for the recognition.
 const NUM_BYTES: u64 = 512;
 /// Magic number at the start of the files of `torch.save` before `PyTorch` 1.6, in a pickle of any protocol.
 const LEGACY: &[u8] = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
-/// Largest number of bytes of a pickle before the magic number.
 const MAX_LEGACY_START: usize = 16;
 
-/// Refuses folders, pipes and devices.
 pub(crate) fn require_file(path: &Path) -> Result<(), DataError> {
     let bad = |what: &str| Err(DataError::BadCheckpoint { what: what.into(), path: path.to_path_buf() });
     let opening = "opening the checkpoint";
@@ -56,7 +53,7 @@ fn other_kind(start: &[u8], num_bytes: u64) -> Option<&'static str> {
     if start.get(8) == Some(&b'{') && header.is_some_and(|length| length < num_bytes) {
         return Some(
             "a safetensors file; convert it in Python: torch.save({\"state_dict\": safetensors.torch.load_file(\"OLD\")}, \
-             \"NEW.ckpt\"), or write it with `clift export --format pytorch` if it was exported by clift",
+             \"NEW.ckpt\")",
         );
     }
     if ["<!doctype", "<html", "<?xml", "<head"].iter().any(|tag| text.starts_with(tag.as_bytes())) {
@@ -80,12 +77,10 @@ mod tests {
         let safetensors = [&9_u64.to_le_bytes()[..], b"{\"a\": {}}"].concat();
         for (bytes, what) in [
             (&b""[..], "an empty file"),
-            (&[b"\x80\x02", LEGACY, b"\x80\x02M\xe9\x03."].concat(), "before PyTorch 1.6"),
             (&[b"\x80\x04\x95\x0d\0\0\0\0\0\0\0", LEGACY].concat(), "before PyTorch 1.6"),
             (b"\x80\x04\x95\x00", "a plain pickle"),
             (&safetensors, "a safetensors file"),
             (b"\n<!DOCTYPE html><html>", "a web page"),
-            (b"<html>404</html>", "a web page"),
             (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         ] {
             std::fs::write(&path, bytes).unwrap();
@@ -103,15 +98,7 @@ mod tests {
         assert!(refused(root.path()).contains("a directory; give the checkpoint file in it"));
         std::fs::write(root.path().join("model.safetensors"), "").unwrap();
         assert!(refused(root.path()).contains("needs no import"));
-    }
-
-    #[cfg(unix)]
-    #[test]
-    fn pipes_are_refused_unopened() {
-        let root = tempfile::tempdir().unwrap();
-        let path = root.path().join("pipe");
-        assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
-        let message = require_file(&path).unwrap_err().to_string();
-        assert!(message.contains("no regular file"), "{message}");
+        #[cfg(unix)] // a pipe would block
+        assert!(refused(Path::new("/dev/zero")).contains("no regular file"));
     }
 }

@@ -1,16 +1,10 @@
-//! Pickles inside `torch.save` archives, parsed without execution: the few opcodes of `torch.save` build plain values,
-//! and only the Python names of tensors, storages and `OrderedDict` are accepted.
-//!
-//! Values are stored in one flat arena and refer to each other by [`ValueId`]. A hostile file can therefore build neither
-//! a leaking cycle nor a nesting that overflows the stack, and the memory of a pickle is bounded by
-//! [`MAX_BYTES`](crate::torch::values::MAX_BYTES) and [`MAX_VALUES`](crate::torch::values::MAX_VALUES).
+//! Values of a pickle inside a `torch.save` archive, parsed without execution, with limits of their number and size.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
 use crate::error::DataError;
-use crate::torch::allow_list::{UnknownClasses, UnpickleError};
-use crate::torch::unpickler::unpickle;
+use crate::torch::unpickler::{UnknownClasses, UnpickleError, Unpickler};
 use crate::torch::values::{Value, ValueId};
 
 /// An unpickled object with all values that it refers to.
@@ -42,8 +36,8 @@ impl Pickle {
     }
 
     fn read(bytes: &[u8], path: &Path, unknown: UnknownClasses) -> Result<Self, DataError> {
-        match unpickle(bytes, unknown) {
-            Ok((root, machine)) => Ok(Self { values: machine.values, root, skipped_objects: machine.skipped_objects }),
+        match Unpickler::read(bytes, unknown) {
+            Ok((root, Unpickler { values, skipped_objects, .. })) => Ok(Self { values, root, skipped_objects }),
             Err(UnpickleError::Refused(name)) => Err(DataError::RefusedGlobal { name, path: path.to_path_buf() }),
             Err(UnpickleError::Bad(what)) => Err(DataError::BadPickle { what, path: path.to_path_buf() }),
         }
@@ -95,18 +89,15 @@ mod tests {
             values[1..],
             [&Value::Int(-2), &Value::Int(1 << 40), &Value::Float(0.5), &Value::None, &Value::Bool(true)]
         );
-        let storage = Storage { element_type: ElementType::F32, key: "7".into(), num_elements: 10 };
+        let storage = Storage { element_type: ElementType::F32, key: "7".into() };
         let tensor = Tensor { storage, offset: 4, shape: vec![2, 3], stride: vec![3, 1] };
         assert!(tensor.is_contiguous());
         assert_eq!(pickle.item(values[0], "x"), Some(&Value::Tensor(Box::new(tensor))));
         assert_eq!(pickle.item(values[0], "y"), None);
-    }
-
-    #[test]
-    fn newer_protocols_name_globals_from_the_stack() {
-        let bytes =
+        // Newer protocols take names from the stack.
+        let newer =
             b"\x80\x04\x95\x00\x00\x00\x00\x00\x00\x00\x00\x8c\x0bcollections\x94\x8c\x0bOrderedDict\x94\x93)R.";
-        assert_eq!(parse(bytes).unwrap().root(), &Value::Dict(Vec::new()));
+        assert_eq!(parse(newer).unwrap().root(), &Value::Dict(Vec::new()));
     }
 
     #[test]

@@ -60,7 +60,6 @@ impl PickleWriter {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// Returns the pickle so far.
     #[cfg(test)]
     pub fn pickle(&self) -> &[u8] {
         &self.bytes

@@ -1,8 +1,8 @@
-//! Opcodes of `torch.save`, executed on a [`PickleMachine`].
+//! The unpickler: the opcodes of `torch.save`, bounded, without execution, and the Python names that a pickle may use.
 
-use crate::torch::allow_list::{UnknownClasses, UnpickleError};
-use crate::torch::pickle_machine::PickleMachine;
-use crate::torch::values::{Global, MAX_BYTES, Storage, Tensor, Value, ValueId};
+use std::collections::{BTreeSet, HashMap};
+
+use crate::torch::values::{ElementType, Global, MAX_BYTES, MAX_VALUES, Storage, Tensor, Value, ValueId};
 
 /// Deepest nesting of unfinished lists, dicts and tuples in chunks, which need five levels.
 const MAX_DEPTH: usize = 32;
@@ -11,130 +11,62 @@ const MAX_CHECKPOINT_DEPTH: usize = 256;
 const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers the storages.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
-/// Longest module or name of a Python object.
 const MAX_NAME_BYTES: usize = 1000;
+const MAX_SKIPPED_OBJECTS: usize = 256;
 
-/// Reads a pickle; returns the outermost value and the machine that holds all values.
-pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<(ValueId, PickleMachine<'_>), UnpickleError> {
-    let mut machine = PickleMachine::new(bytes, unknown);
-    match machine.run() {
-        Ok(root) => Ok((root, machine)),
-        Err(UnpickleError::Bad(what)) => Err(UnpickleError::Bad(format!("{what} (at byte {})", machine.at))),
-        Err(refused) => Err(refused),
-    }
+const NO_OPERANDS: &str = "an opcode without its operands";
+
+#[derive(Default)]
+pub(crate) struct Unpickler<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    unknown: UnknownClasses,
+    pub values: Vec<Value>,
+    stack: Vec<ValueId>,
+    marks: Vec<usize>,
+    memo: HashMap<u32, ValueId>,
+    pub skipped_objects: BTreeSet<String>,
 }
 
-impl PickleMachine<'_> {
+impl<'a> Unpickler<'a> {
+    /// Reads a pickle; returns the outermost value and the unpickler that holds all values.
+    pub fn read(bytes: &'a [u8], unknown: UnknownClasses) -> Result<(ValueId, Self), UnpickleError> {
+        let mut unpickler = Self { bytes, unknown, ..Self::default() };
+        match unpickler.run() {
+            Ok(root) => Ok((root, unpickler)),
+            Err(UnpickleError::Bad(what)) => Err(format!("{what} (at byte {})", unpickler.at).into()),
+            Err(refused) => Err(refused),
+        }
+    }
+
     fn run(&mut self) -> Result<ValueId, UnpickleError> {
         if self.bytes.len() > MAX_BYTES {
-            let what = format!("the pickle has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len());
-            return Err(UnpickleError::Bad(what));
+            return Err(format!("the pickle has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len()).into());
         }
-        let max_depth = if self.skips_unknown() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
         loop {
             match self.u8()? {
                 b'.' => return self.pop(),
-                0x80 => match self.u8()? {
-                    2..=5 => {}
-                    version => return Err(UnpickleError::Bad(format!("protocol {version}, expected 2 to 5"))),
-                },
-                0x95 => drop(self.take(8)?), // FRAME: the length of a frame, not needed
-                b'(' if self.marks.len() == max_depth => {
-                    return Err(UnpickleError::Bad(format!("nested deeper than {max_depth} levels")));
-                }
-                b'(' => self.marks.push(self.stack.len()),
-                opcode => {
-                    let known = self.read_scalar(opcode)?
-                        || self.read_container(opcode)?
-                        || self.read_reference(opcode)?
-                        || self.skips_unknown() && self.read_object(opcode)?;
-                    if !known {
-                        let what = format!("opcode {opcode:#04x}, which torch.save does not write");
-                        return Err(UnpickleError::Bad(what));
-                    }
-                }
+                opcode => self.execute(opcode)?,
             }
         }
     }
 
-    /// Handles the opcodes of numbers, strings, `None`, `True` and `False`; returns false for another opcode.
-    fn read_scalar(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
-        let value = match opcode {
-            b'N' => Value::None,
-            0x88 => Value::Bool(true),
-            0x89 => Value::Bool(false),
-            b'J' => Value::Int(i64::from(i32::from_le_bytes(self.array()?))),
-            b'K' => Value::Int(i64::from(self.u8()?)),
-            b'M' => Value::Int(i64::from(u16::from_le_bytes(self.array()?))),
-            0x8a => {
-                let length = self.u8()? as usize;
-                let digits = self.take(length)?;
-                if length > 8 {
-                    if !self.skips_unknown() {
-                        return Err("an integer of more than 64 bits".into());
-                    }
-                    self.push(Value::Opaque)?;
-                    return Ok(true);
-                }
-                let digits = digits.to_vec();
-                let negative = digits.last().is_some_and(|high| high & 0x80 != 0);
-                let mut extended = [if negative { 0xff } else { 0 }; 8];
-                extended[..length].copy_from_slice(&digits);
-                Value::Int(i64::from_le_bytes(extended))
-            }
-            b'G' => Value::Float(f64::from_be_bytes(self.array()?)),
-            b'X' | 0x8c => {
-                let length = self.short_or_u32(opcode == 0x8c)?;
-                Value::Str(self.text(length as usize)?)
-            }
-            _ => return Ok(false),
-        };
-        self.push(value)?;
-        Ok(true)
-    }
-
-    /// Handles the opcodes of lists, tuples and dicts; returns false for another opcode.
-    fn read_container(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
+    fn execute(&mut self, opcode: u8) -> Result<(), UnpickleError> {
         match opcode {
-            b']' => self.push(Value::List(Vec::new()))?,
-            b'}' => self.push(Value::Dict(Vec::new()))?,
-            b')' => self.push(Value::Tuple(Vec::new()))?,
-            0x85..=0x87 => {
-                let mut items = Vec::new();
-                for _ in 0..opcode - 0x84 {
-                    items.push(self.pop()?);
+            // PROTO, FRAME (the length of a frame, not needed), MARK
+            0x80 => match self.u8()? {
+                2..=5 => {}
+                version => return Err(format!("protocol {version}, expected 2 to 5").into()),
+            },
+            0x95 => drop(self.take(8)?),
+            b'(' => {
+                let max_depth = if self.skips_unknown() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
+                if self.marks.len() == max_depth {
+                    return Err(format!("nested deeper than {max_depth} levels").into());
                 }
-                items.reverse();
-                self.push(Value::Tuple(items))?;
+                self.marks.push(self.stack.len());
             }
-            b't' => {
-                let items = self.pop_to_mark()?;
-                self.push(Value::Tuple(items))?;
-            }
-            b'a' => {
-                let item = self.pop()?;
-                self.extend_list(&[item])?;
-            }
-            b'e' => {
-                let items = self.pop_to_mark()?;
-                self.extend_list(&items)?;
-            }
-            b's' => {
-                let (value, key) = (self.pop()?, self.pop()?);
-                self.extend_dict(&[key, value])?;
-            }
-            b'u' => {
-                let items = self.pop_to_mark()?;
-                self.extend_dict(&items)?;
-            }
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
-
-    /// Handles the opcodes of the memo, Python names, storages and calls; returns false for another opcode.
-    fn read_reference(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
-        match opcode {
+            // The memo, Python names, storages, calls
             b'q' | b'r' => {
                 let slot = self.short_or_u32(opcode == b'q')?;
                 self.remember(slot)?;
@@ -142,7 +74,8 @@ impl PickleMachine<'_> {
             0x94 => self.remember(self.memo.len() as u32)?,
             b'h' | b'j' => {
                 let slot = self.short_or_u32(opcode == b'h')?;
-                self.recall(slot)?;
+                let value = *self.memo.get(&slot).ok_or_else(|| format!("memo slot {slot} was never set"))?;
+                self.stack.push(value);
             }
             b'c' => {
                 let (module, name) = (self.line()?, self.line()?);
@@ -162,31 +95,251 @@ impl PickleMachine<'_> {
             }
             b'Q' => {
                 let id = self.pop()?;
-                let storage = self.storage(id).map(|storage| Value::Storage(Box::new(storage)));
-                let value = self.or_opaque(storage)?;
-                self.push(value)?;
+                self.push_or_skip(self.storage(id).map(|storage| Value::Storage(Box::new(storage))))?;
             }
             b'R' => {
                 let (arguments, callee) = (self.pop()?, self.pop()?);
-                let value = self.or_opaque(self.call(callee, arguments))?;
-                self.push(value)?;
+                self.push_or_skip(self.call(callee, arguments))?;
             }
-            _ => return Ok(false),
+            _ => return self.read_value(opcode),
         }
-        Ok(true)
+        Ok(())
+    }
+
+    /// Handles the opcodes of numbers, strings, `None`, `True`, `False`, lists, dicts and tuples.
+    fn read_value(&mut self, opcode: u8) -> Result<(), UnpickleError> {
+        let value = match opcode {
+            b'N' => Value::None,
+            0x88 => Value::Bool(true),
+            0x89 => Value::Bool(false),
+            b'J' => Value::Int(i32::from_le_bytes(self.array()?).into()),
+            b'K' => Value::Int(self.u8()?.into()),
+            b'M' => Value::Int(u16::from_le_bytes(self.array()?).into()),
+            0x8a => self.long()?,
+            b'G' => Value::Float(f64::from_be_bytes(self.array()?)),
+            b'X' | 0x8c => {
+                let length = self.short_or_u32(opcode == 0x8c)?;
+                Value::Str(self.text(length as usize)?)
+            }
+            b']' => Value::List(Vec::new()),
+            b'}' => Value::Dict(Vec::new()),
+            b')' => Value::Tuple(Vec::new()),
+            0x85..=0x87 => {
+                let mut items = (0..opcode - 0x84).map(|_| self.pop()).collect::<Result<Vec<_>, _>>()?;
+                items.reverse();
+                Value::Tuple(items)
+            }
+            b't' => Value::Tuple(self.pop_to_mark()?),
+            b'a' => {
+                let item = self.pop()?;
+                return self.extend_list(&[item]);
+            }
+            b'e' => {
+                let items = self.pop_to_mark()?;
+                return self.extend_list(&items);
+            }
+            b's' => {
+                let (value, key) = (self.pop()?, self.pop()?);
+                return self.extend_dict(&[key, value]);
+            }
+            b'u' => {
+                let items = self.pop_to_mark()?;
+                return self.extend_dict(&items);
+            }
+            _ => return self.skip_object(opcode),
+        };
+        self.push(value)
+    }
+
+    /// Handles the opcodes that occur in checkpoints but not in chunks: objects of any class, sets and bytes. All are skipped.
+    fn skip_object(&mut self, opcode: u8) -> Result<(), UnpickleError> {
+        match opcode {
+            _ if !self.skips_unknown() => return Err(unknown_opcode(opcode)),
+            // BUILD: sets the state of the object below it.
+            b'b' => {
+                self.pop()?;
+                self.top()?;
+            }
+            // NEWOBJ, NEWOBJ_EX: a class and its arguments.
+            0x81 | 0x92 => {
+                for _ in 0..if opcode == 0x81 { 2 } else { 3 } {
+                    self.pop()?;
+                }
+                self.push(Value::Opaque)?;
+            }
+            // ADDITEMS, EMPTY_SET, FROZENSET
+            0x90 => {
+                self.pop_to_mark()?;
+                self.top()?;
+            }
+            0x8f | 0x91 => {
+                if opcode == 0x91 {
+                    self.pop_to_mark()?;
+                }
+                self.push(Value::Opaque)?;
+            }
+            // SHORT_BINSTRING, SHORT_BINBYTES: one byte of length; BINSTRING, BINBYTES, LONG4: four; BINBYTES8,
+            // BYTEARRAY8, BINUNICODE8: eight.
+            b'U' | b'C' | b'T' | b'B' | 0x8b | 0x8e | 0x96 | 0x8d => {
+                let length = match opcode {
+                    0x8e | 0x96 | 0x8d => u64::from_le_bytes(self.array()?),
+                    _ => self.short_or_u32(matches!(opcode, b'U' | b'C'))?.into(),
+                };
+                self.take(usize::try_from(length).unwrap_or(usize::MAX))?;
+                self.push(Value::Opaque)?;
+            }
+            // POP, POP_MARK, DUP
+            b'0' => drop(self.pop()?),
+            b'1' => drop(self.pop_to_mark()?),
+            b'2' => {
+                let top = self.top()?;
+                self.stack.push(top);
+            }
+            _ => return Err(unknown_opcode(opcode)),
+        }
+        Ok(())
+    }
+
+    fn skips_unknown(&self) -> bool {
+        self.unknown == UnknownClasses::Skip
+    }
+
+    fn push_global(&mut self, module: &str, name: &str) -> Result<(), UnpickleError> {
+        let value = if let Some(global) = global(module, name, self.unknown)? {
+            Value::Global(global)
+        } else {
+            if self.skipped_objects.len() < MAX_SKIPPED_OBJECTS {
+                self.skipped_objects.insert(escaped_name(module, name));
+            }
+            Value::Opaque
+        };
+        self.push(value)
+    }
+
+    fn get(&self, id: ValueId) -> &Value {
+        &self.values[id.0 as usize]
+    }
+
+    fn push(&mut self, value: Value) -> Result<(), UnpickleError> {
+        if self.values.len() == MAX_VALUES {
+            return Err(format!("more than {MAX_VALUES} values").into());
+        }
+        self.stack.push(ValueId(self.values.len() as u32));
+        self.values.push(value);
+        Ok(())
+    }
+
+    /// Pushes a value; a skipped object instead of an error, if unknown classes are skipped.
+    fn push_or_skip(&mut self, value: Result<Value, UnpickleError>) -> Result<(), UnpickleError> {
+        let value = if self.skips_unknown() { value.unwrap_or(Value::Opaque) } else { value? };
+        self.push(value)
+    }
+
+    fn pop(&mut self) -> Result<ValueId, UnpickleError> {
+        let top = self.top()?;
+        self.stack.pop();
+        Ok(top)
+    }
+
+    fn pop_to_mark(&mut self) -> Result<Vec<ValueId>, UnpickleError> {
+        let mark = self.marks.pop().ok_or("an opcode without its mark")?;
+        Ok(self.stack.split_off(mark))
+    }
+
+    fn top(&self) -> Result<ValueId, UnpickleError> {
+        let floor = self.marks.last().copied().unwrap_or(0);
+        self.stack[floor..].last().copied().ok_or_else(|| NO_OPERANDS.into())
+    }
+
+    /// Appends items to the list on top of the stack. Items that are added to a skipped object are skipped as well.
+    fn extend_list(&mut self, items: &[ValueId]) -> Result<(), UnpickleError> {
+        let list = self.top()?;
+        match &mut self.values[list.0 as usize] {
+            Value::Opaque => {}
+            Value::List(list) => list.extend_from_slice(items),
+            _ => return Err("an append to something other than a list".into()),
+        }
+        Ok(())
+    }
+
+    fn extend_dict(&mut self, items: &[ValueId]) -> Result<(), UnpickleError> {
+        let dict = self.top()?;
+        match &mut self.values[dict.0 as usize] {
+            Value::Opaque => {}
+            Value::Dict(_) if !items.len().is_multiple_of(2) => return Err("a dict key without a value".into()),
+            Value::Dict(dict) => dict.extend(items.chunks_exact(2).map(|pair| (pair[0], pair[1]))),
+            _ => return Err("an item set on something other than a dict".into()),
+        }
+        Ok(())
+    }
+
+    fn remember(&mut self, slot: u32) -> Result<(), UnpickleError> {
+        let value = self.top()?;
+        if self.memo.len() == MAX_VALUES {
+            return Err(format!("more than {MAX_VALUES} remembered values").into());
+        }
+        self.memo.insert(slot, value);
+        Ok(())
+    }
+
+    fn take(&mut self, length: usize) -> Result<&[u8], UnpickleError> {
+        let rest = &self.bytes[self.at..];
+        let taken = rest.get(..length).ok_or("the pickle ends in the middle of a value")?;
+        self.at += length;
+        Ok(taken)
+    }
+
+    fn array<const LENGTH: usize>(&mut self) -> Result<[u8; LENGTH], UnpickleError> {
+        let mut array = [0; LENGTH];
+        array.copy_from_slice(self.take(LENGTH)?);
+        Ok(array)
+    }
+
+    fn u8(&mut self) -> Result<u8, UnpickleError> {
+        Ok(self.array::<1>()?[0])
+    }
+
+    /// Reads an unsigned integer of one byte, or of four.
+    fn short_or_u32(&mut self, is_short: bool) -> Result<u32, UnpickleError> {
+        Ok(if is_short { self.u8()?.into() } else { u32::from_le_bytes(self.array()?) })
+    }
+
+    /// Reads a signed integer of up to 64 bits; longer ones are skipped in checkpoints.
+    fn long(&mut self) -> Result<Value, UnpickleError> {
+        let length = self.u8()? as usize;
+        let digits = self.take(length)?;
+        let is_negative = digits.last().is_some_and(|high| high & 0x80 != 0);
+        let mut extended = [if is_negative { 0xff } else { 0 }; 8];
+        match extended.get_mut(..length) {
+            Some(low) => low.copy_from_slice(digits),
+            None if self.skips_unknown() => return Ok(Value::Opaque),
+            None => return Err("an integer of more than 64 bits".into()),
+        }
+        Ok(Value::Int(i64::from_le_bytes(extended)))
+    }
+
+    fn text(&mut self, length: usize) -> Result<String, UnpickleError> {
+        String::from_utf8(self.take(length)?.to_vec()).map_err(|_| "a string that is not UTF-8".into())
+    }
+
+    fn line(&mut self) -> Result<String, UnpickleError> {
+        let length = self.bytes[self.at..].iter().position(|&byte| byte == b'\n');
+        let line = self.text(length.ok_or("the pickle ends in the middle of a name")?)?;
+        self.at += 1;
+        Ok(line)
     }
 
     /// Reads a storage: `("storage", <storage type>, key, device, number of elements)`.
     fn storage(&self, id: ValueId) -> Result<Storage, UnpickleError> {
         let Value::Tuple(fields) = self.get(id) else { return Err("a storage that is not a tuple".into()) };
         let [kind, storage_type, key, _device, num_elements] = fields[..] else {
-            return Err(UnpickleError::Bad(format!("a storage of {} fields, expected 5", fields.len())));
+            return Err(format!("a storage of {} fields, expected 5", fields.len()).into());
         };
         match (self.get(kind), self.get(storage_type), self.get(key), self.get(num_elements)) {
             (Value::Str(kind), Value::Global(Global::Storage(element_type)), Value::Str(key), Value::Int(count))
                 if kind == "storage" && key.len() <= MAX_STORAGE_KEY_BYTES && *count >= 0 =>
             {
-                Ok(Storage { element_type: *element_type, key: key.clone(), num_elements: *count as u64 })
+                Ok(Storage { element_type: *element_type, key: key.clone() })
             }
             _ => Err("a storage whose fields are not (\"storage\", type, name, device, count)".into()),
         }
@@ -223,13 +376,115 @@ impl PickleMachine<'_> {
     fn counts(&self, id: ValueId) -> Result<Vec<u64>, UnpickleError> {
         let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are not a tuple".into()) };
         if items.len() > MAX_DIMENSIONS {
-            let what = format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len());
-            return Err(UnpickleError::Bad(what));
+            return Err(format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len()).into());
         }
         let count = |id: &ValueId| match self.get(*id) {
             Value::Int(count) => u64::try_from(*count).map_err(|_| "a tensor with a negative size or stride".into()),
             _ => Err("a tensor with a size or stride that is not an integer".into()),
         };
         items.iter().map(count).collect()
+    }
+}
+
+fn unknown_opcode(opcode: u8) -> UnpickleError {
+    format!("opcode {opcode:#04x}, which torch.save does not write").into()
+}
+
+/// Treatment of objects whose classes are not on the allow-list.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum UnknownClasses {
+    #[default]
+    Refuse,
+    /// The objects are skipped, as [`Value::Opaque`](crate::torch::values::Value::Opaque).
+    Skip,
+}
+
+pub(crate) enum UnpickleError {
+    /// A Python name that is not allowed.
+    Refused(String),
+    Bad(String),
+}
+
+impl<S: Into<String>> From<S> for UnpickleError {
+    fn from(what: S) -> Self {
+        Self::Bad(what.into())
+    }
+}
+
+/// Looks a Python name up in the allow-list; `None` for a name whose objects are skipped.
+pub(crate) fn global(module: &str, name: &str, unknown: UnknownClasses) -> Result<Option<Global>, UnpickleError> {
+    let known = match (module, name) {
+        ("torch._utils", "_rebuild_tensor_v2") => Some(Global::RebuildTensor),
+        ("collections", "OrderedDict") => Some(Global::OrderedDict),
+        ("torch", "ByteStorage") => Some(Global::Storage(ElementType::U8)),
+        ("torch", "IntStorage") => Some(Global::Storage(ElementType::I32)),
+        ("torch", "LongStorage") => Some(Global::Storage(ElementType::I64)),
+        ("torch", "FloatStorage") => Some(Global::Storage(ElementType::F32)),
+        ("torch", "DoubleStorage") => Some(Global::Storage(ElementType::F64)),
+        _ => None,
+    };
+    if known.is_some() {
+        return Ok(known);
+    }
+    if unknown == UnknownClasses::Refuse || is_attack(module, name) {
+        return Err(UnpickleError::Refused(escaped_name(module, name)));
+    }
+    Ok(match (module, name) {
+        ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Some(Global::RebuildParameter),
+        ("torch", "HalfStorage") => Some(Global::Storage(ElementType::F16)),
+        ("torch", "BFloat16Storage") => Some(Global::Storage(ElementType::BF16)),
+        _ => None,
+    })
+}
+
+/// Formats a name of a possibly hostile file: at most 120 characters, without control characters.
+pub(crate) fn escaped_name(module: &str, name: &str) -> String {
+    let name: String = format!("{module}.{name}").chars().take(120).collect();
+    name.escape_debug().to_string()
+}
+
+/// Returns whether the file is likely an attack on programs that execute pickles: no training program writes this name.
+fn is_attack(module: &str, name: &str) -> bool {
+    let package = module.split('.').next().unwrap_or_default();
+    match package {
+        "os" | "posix" | "nt" | "subprocess" | "pty" | "commands" | "shutil" | "socket" | "runpy" | "ctypes"
+        | "webbrowser" | "importlib" | "pickle" | "_pickle" | "cPickle" | "marshal" | "timeit" | "requests"
+        | "http" | "ftplib" | "smtplib" | "pdb" | "bdb" | "profile" | "cProfile" | "trace" | "doctest" | "sys"
+        | "multiprocessing" | "asyncio" | "pip" | "pkgutil" => true,
+        "builtins" | "__builtin__" => {
+            matches!(name, "eval" | "exec" | "execfile" | "compile" | "open" | "__import__" | "input" | "breakpoint")
+        }
+        "urllib" | "urllib2" => module != "urllib.parse",
+        // A project may have a package named `code`.
+        "code" => module == "code",
+        "torch" => match module {
+            "torch" => matches!(name, "load" | "save" | "compile"),
+            "torch.serialization" => name != "_get_layout", // pickled layouts use this name
+            "torch.jit" => name == "load",
+            "torch.utils.cpp_extension" => true,
+            _ => module.starts_with("torch.hub") || module.starts_with("torch.package"),
+        },
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attacks_differ_from_names_of_training_programs() {
+        let attacks = "os.system builtins.eval _pickle.loads timeit.timeit urllib.request.urlopen requests.api.get \
+                       code.interact sys.exit multiprocessing.util.spawnv_passfds torch.load torch.hub.load \
+                       torch.serialization.load";
+        let others = "builtins.getattr builtins.set torch.device torch.serialization._get_layout \
+                      torch.optim.lr_scheduler.LambdaLR urllib.parse.ParseResult code.config.ModelConfig \
+                      osgeo.osr.SpatialReference pathlib.PosixPath";
+        for (names, is_refused) in [(attacks, true), (others, false)] {
+            for (module, name) in names.split(' ').map(|name| name.rsplit_once('.').unwrap()) {
+                let found = global(module, name, UnknownClasses::Skip);
+                assert_eq!(matches!(found, Err(UnpickleError::Refused(_))), is_refused, "{module}.{name}");
+            }
+        }
     }
 }

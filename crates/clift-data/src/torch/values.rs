@@ -1,4 +1,4 @@
-//! Values of a pickle, with limits of their number and size.
+//! Values of a pickle, and limits of their number and size.
 
 /// Largest size of a pickle, in bytes; a chunk of 2,000 frames has about 150 kB.
 pub const MAX_BYTES: usize = 16 << 20;
@@ -40,7 +40,6 @@ impl ElementType {
     }
 }
 
-/// A Python name from the allow-list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Global {
     /// `torch._utils._rebuild_tensor_v2`
@@ -53,25 +52,19 @@ pub enum Global {
     Storage(ElementType),
 }
 
-/// A storage: a member of the archive beside the pickle.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Storage {
     pub element_type: ElementType,
     /// Name of the archive member below `data/`.
     pub key: String,
-    /// Number of elements according to the pickle.
-    pub num_elements: u64,
 }
 
 /// A tensor as a view of a storage. Counts are in elements and not checked against the archive.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tensor {
     pub storage: Storage,
-    /// Index of the first element.
     pub offset: u64,
-    /// Sizes of the dimensions.
     pub shape: Vec<u64>,
-    /// Steps between neighbours, per dimension.
     pub stride: Vec<u64>,
 }
 
@@ -94,7 +87,6 @@ impl Tensor {
 pub enum Value {
     None,
     Bool(bool),
-    /// An integer of at most 64 bits.
     Int(i64),
     Float(f64),
     Str(String),

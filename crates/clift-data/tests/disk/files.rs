@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_core::RgbImage;
+use clift_data::encode_png;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -17,6 +19,12 @@ pub fn copy_of_layout(name: &str) -> TempDir {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layout(name), root.path());
     root
+}
+
+/// Returns a PNG with an aspect ratio of 3 : 2 whose pixels have one gray value.
+pub fn gray(width: usize, value: usize) -> Vec<u8> {
+    let height = width * 2 / 3;
+    encode_png(&RgbImage { width, height, rgb: vec![value as u8; width * height * 3] }).unwrap()
 }
 
 /// Writes the image files and the `transforms.json` of a capture.

@@ -8,18 +8,17 @@ use clift_data::{
     SourceOptions, Split, ViewIndices,
 };
 
-use crate::files::{copy_folder, copy_of_layout, layout};
+use crate::files::{copy_folder, fixtures, layout};
 use crate::{open, open_test, open_with};
 
 const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
 /// Folder, split, layout and key of every fixture.
-const LAYOUTS: [(&str, Split, SourceKind, &str); 10] = [
+const LAYOUTS: [(&str, Split, SourceKind, &str); 9] = [
     ("chunks", Split::Test, SourceKind::Chunks, KEY),
     ("depthsplat", Split::Train, SourceKind::Chunks, "dl3dv_"),
     ("scenes", Split::Test, SourceKind::Scenes, KEY),
     ("re10k_txt", Split::Test, SourceKind::Re10kTxt, KEY),
-    ("re10k_folders", Split::Test, SourceKind::Re10kTxt, KEY),
     ("dl3dv_flat", Split::Test, SourceKind::Dl3dv, KEY),
     ("dl3dv", Split::Test, SourceKind::Dl3dv, KEY),
     ("dl3dv_benchmark", Split::Test, SourceKind::Dl3dv, KEY),
@@ -32,7 +31,7 @@ fn open_kind(root: &Path, split: Split, kind: SourceKind) -> OpenedSource {
 }
 
 fn clip(source: Arc<dyn SceneSource>) -> Clip {
-    let options = ClipOptions { width: 16, height: 16, exact_principal_point: true, ..ClipOptions::default() };
+    let options = ClipOptions { width: 16, height: 16, ..ClipOptions::default() };
     let views = ViewIndices { context: vec![0, 2, 5], target: vec![1, 3, 4] };
     ClipReader { source, options }.read(0, &views).unwrap()
 }
@@ -55,7 +54,7 @@ fn all_layouts_give_the_same_clip() {
             assert!(source.key(0).starts_with(key), "{name}: {}", source.key(0));
             let found = if key == "attic" { key } else { KEY };
             assert_eq!((source.find(found), source.num_frames(0).unwrap()), (Some(0), 6), "{name}");
-            let info = SourceInfo::read(source.as_ref()).unwrap();
+            let info = SourceInfo::read(source.as_ref());
             // atan(0.515625 / 0.875) + atan(0.484375 / 0.875), by hand
             let fov_deg = format!("{:.1}", info.fov_deg.unwrap().max);
             assert_eq!((info.num_scenes, info.image_sizes["32x18"], fov_deg.as_str()), (1, 1, "59.5"), "{name}");
@@ -74,28 +73,19 @@ fn all_layouts_give_the_same_clip() {
 
 #[test]
 fn cameras_equal_those_of_the_fixture_script() {
+    let source = open_test(&layout("capture")).unwrap().source;
+    let camera = source.cameras(0).unwrap()[3];
+    let k = camera.intrinsics;
     // Frame 3 of the script: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
-    for (name, split, ..) in LAYOUTS {
-        let source = open_kind(&layout(name), split, SourceKind::Auto).source;
-        let camera = source.cameras(0).unwrap()[3];
-        let k = camera.intrinsics;
-        let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
-        let got = camera.c2w.translation.to_array().into_iter().chain([k.fx, k.fy, k.cx, k.cy]);
-        for (got, expected) in got.zip(expected) {
-            assert!((got - expected).abs() < 1e-6, "{name}: {got} against {expected}"); // f32
-        }
+    let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
+    let got = camera.c2w.translation.to_array().into_iter().chain([k.fx, k.fy, k.cx, k.cy]);
+    for (got, expected) in got.zip(expected) {
+        assert!((got - expected).abs() < 1e-6, "{got} against {expected}");
+    }
+    for name in ["capture", "chunks"] {
+        let source = open_test(&layout(name)).unwrap().source;
         assert!(source.frame(0, 6).is_err() && source.frame(1, 0).is_err() && source.cameras(1).is_err(), "{name}");
     }
-}
-
-#[test]
-fn timestamps_and_urls_come_from_the_files() {
-    let times = |name: &str| open_test(&layout(name)).unwrap().source.timestamps(0).unwrap();
-    assert_eq!(times("re10k_txt")[..2], [1_000_000, 1_033_367]);
-    assert_eq!(times("dl3dv"), [1, 2, 3, 4, 5, 6]);
-    assert_eq!(times("capture"), [8, 9, 10, 11, 12, 13]);
-    let url = |name: &str| open_test(&layout(name)).unwrap().source.url(0).unwrap();
-    assert_eq!((url("re10k_txt").as_str(), url("dl3dv").as_str()), ("https://example.org/watch", ""));
 }
 
 #[test]
@@ -111,67 +101,49 @@ fn captures_open_as_folders_or_file() {
     assert_eq!((model.key(0), model.num_scenes()), ("attic", 1));
 }
 
-/// Writes two copies of the DL3DV fixture, with a frame of the second renamed; returns their keys.
-fn two_scenes(root: &Path) -> [String; 2] {
-    let keys = [KEY.to_owned(), KEY.replace('d', "e")];
-    for key in &keys {
-        copy_folder(&layout("dl3dv/1K").join(KEY), &root.join("2K").join(key));
-    }
-    let images = root.join("2K").join(&keys[1]).join("images_8");
-    std::fs::rename(images.join("frame_00004.png"), images.join("4.png")).unwrap();
-    keys
-}
-
 #[test]
-fn incomplete_scenes_are_skipped_unless_asked_for() {
+fn incomplete_scenes_are_skipped() {
     let root = tempfile::tempdir().unwrap();
-    let [whole, torn] = two_scenes(root.path());
+    let torn = KEY.replace('d', "e");
+    for key in [KEY, &torn] {
+        copy_folder(&layout("dl3dv/1K").join(KEY), &root.path().join("2K").join(key));
+    }
+    std::fs::remove_file(root.path().join("2K").join(&torn).join("images_8/frame_00004.png")).unwrap();
     let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
-    assert_eq!((source.num_scenes(), source.key(0)), (1, whole.as_str()));
+    assert_eq!((source.num_scenes(), source.key(0)), (1, KEY));
     assert_eq!(report.skips[0].reason, "with frames that have no image");
     assert_eq!((&report.frames[0].key, report.frames[0].frame.as_str()), (&torn, "images/frame_00004.png"));
-    let files = FileOptions { keep_incomplete: true, ..FileOptions::default() };
-    let OpenedSource { source, report, .. } = open_with(root.path(), files).unwrap();
-    let scene = source.find(&torn).unwrap();
-    assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 5));
-    assert!(report.skips.is_empty() && report.frames.len() == 1);
     // Images and cameras are joined by name: the frame after the missing one keeps both.
-    let other = source.find(&whole).unwrap();
-    assert_eq!(source.frame(scene, 3).unwrap(), source.frame(other, 4).unwrap());
-    assert_eq!(source.cameras(scene).unwrap()[3], source.cameras(other).unwrap()[4]);
+    let asked = SourceOptions { kind: SourceKind::Captures, ..SourceOptions::default() };
+    let source = open(root.path(), Split::Test, &asked).unwrap().source;
+    let [whole, torn] = [KEY, &torn].map(|key| source.find(key).unwrap());
+    assert_eq!((source.num_scenes(), source.num_frames(torn).unwrap()), (2, 5));
+    assert_eq!(source.frame(torn, 3).unwrap(), source.frame(whole, 4).unwrap());
+    assert_eq!(source.cameras(torn).unwrap()[3], source.cameras(whole).unwrap()[4]);
 }
 
 #[test]
 fn filters_and_sizes_skip_scenes_with_reasons() {
-    let report = |filters: SceneFilters, min_size: [usize; 2]| {
-        let options = SourceOptions { filters, min_size, ..SourceOptions::default() };
-        let OpenedSource { source, report, .. } = open(&layout("dl3dv"), Split::Test, &options).unwrap();
-        assert_eq!(source.num_scenes(), report.num_used());
-        report.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
-    };
-    let none = SceneFilters::default;
-    assert_eq!(report(none(), [32, 18]), [] as [&str; 0]);
-    assert_eq!(report(none(), [32, 19]), ["with images smaller than 32x19"]);
-    assert_eq!(
-        report(SceneFilters { min_frames: 7, ..none() }, [0, 0]),
-        ["shorter than the 7 frames of data.filters.min_frames"]
-    );
-    let narrow = SceneFilters { max_fov_deg: Some(40.0), ..none() };
-    assert_eq!(report(narrow, [0, 0]), ["with a field of view above 40 degrees"]);
-}
-
-#[test]
-fn image_folders_may_be_chosen() {
-    let root = copy_of_layout("dl3dv");
-    let scene = root.path().join("1K").join(KEY);
-    copy_folder(&scene.join("images_8"), &scene.join("small"));
-    let chosen = |folder: &str| {
-        open_with(root.path(), FileOptions { image_folder: Some(folder.into()), ..FileOptions::default() })
-    };
-    assert_eq!(chosen("small").unwrap().source.num_frames(0).unwrap(), 6);
-    let message = chosen("large").err().unwrap();
-    assert!(message.contains("none of 6 frames has an image; the first is images/frame_00001.png"), "{message}");
-    assert!(message.ends_with("transforms.json"), "{message}");
+    for (root, num_frames) in [(layout("dl3dv"), 6), (fixtures().join("re10k-mini"), 8)] {
+        let opened = |min_frames, max_fov_deg, min_size| {
+            let filters = SceneFilters { min_frames, max_fov_deg };
+            open(&root, Split::Test, &SourceOptions { filters, min_size, ..SourceOptions::default() })
+        };
+        let reasons = |min_frames, max_fov_deg, min_size| {
+            let OpenedSource { source, report, .. } = opened(min_frames, max_fov_deg, min_size).unwrap();
+            assert_eq!(source.num_scenes(), report.num_used());
+            report.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
+        };
+        assert_eq!(reasons(num_frames, Some(60.0), [32, 18]), [] as [&str; 0]);
+        let short = format!("shorter than the {} frames of data.filters.min_frames", num_frames + 1);
+        assert_eq!(reasons(num_frames + 1, None, [0, 0]), [short]);
+        assert_eq!(reasons(0, Some(58.0), [0, 0]), ["with a field of view above 58 degrees"]);
+        if num_frames == 6 {
+            assert_eq!(reasons(0, None, [32, 19]), ["with images smaller than 32x19"]);
+        }
+        let message = opened(0, Some(f64::NAN), [0, 0]).err().unwrap();
+        assert_eq!(message, "`max_fov_deg` = NaN: use a positive number such as 100");
+    }
 }
 
 #[test]
@@ -182,27 +154,10 @@ fn re10k_frames_are_found_where_configured() {
     copy_folder(&layout("re10k_txt/frames"), &elsewhere.join("test"));
     let data = root.path().join("data");
     let message = open_test(&data).err().unwrap();
-    assert!(message.contains("none of 6 frames has an image; the first is 1000000"), "{message}");
+    let expected = "none of 6 frames has an image; the first is 1000000; name frames by time stamp, such as ";
+    assert!(message.contains(expected) && message.contains("data.files.frames"), "{message}");
     let files = FileOptions { frames: Some(elsewhere), ..FileOptions::default() };
     assert_eq!(open_with(&data, files).unwrap().source.num_frames(0).unwrap(), 6);
-}
-
-#[test]
-fn scenes_and_chunks_open_without_an_index() {
-    let root = copy_of_layout("scenes");
-    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
-    assert_eq!((source.key(0), report.to_string()), (KEY, "1 of 1 scenes used".into()));
-    std::fs::write(root.path().join("test/invalid_keys.txt"), KEY).unwrap();
-    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
-    assert_eq!((source.num_scenes(), report.to_string()), (0, "0 of 1 scenes used; 1 in invalid_keys.txt".into()));
-    let chunks = copy_of_layout("chunks");
-    std::fs::remove_file(chunks.path().join("test/index.json")).unwrap();
-    std::fs::write(chunks.path().join("test/000001.torch"), "cut").unwrap();
-    let opened = open_test(chunks.path()).unwrap();
-    assert_eq!((opened.source.key(0), opened.source.num_frames(0).unwrap()), (KEY, 6));
-    let report = opened.report.to_string();
-    assert!(report.starts_with("1 of 2 scenes used; 1 bad chunk: "), "{report}");
-    assert!(report.ends_with("no index.json: the scenes of 2 files were determined from their contents"), "{report}");
 }
 
 #[test]

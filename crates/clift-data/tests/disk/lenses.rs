@@ -121,7 +121,7 @@ fn views_that_no_pinhole_camera_holds_are_cut() {
 }
 
 #[test]
-fn pinhole_lenses_change_nothing_and_invalid_ones_fail() {
+fn pinhole_lenses_change_nothing_and_principal_points_lie_in_the_image() {
     let norm = IntrinsicsNorm { fx: 0.8, fy: 1.1, cx: 0.45, cy: 0.52 };
     let pinhole = Undistortion::new(norm, Lens::default()).unwrap();
     for (got, expected) in [(pinhole.intrinsics_norm().fx, 0.8), (pinhole.intrinsics_norm().fy, 1.1)] {
@@ -129,11 +129,7 @@ fn pinhole_lenses_change_nothing_and_invalid_ones_fail() {
     }
     let frame = RgbImage { width: 7, height: 5, rgb: (0..105).collect() };
     assert_eq!(pinhole.apply(&frame), frame);
-    let message = |norm: IntrinsicsNorm, k1: f64| {
-        let lens = Lens { radial: [k1, 0.0, 0.0, 0.0, 0.0, 0.0], ..Lens::default() };
-        Undistortion::new(norm, lens).unwrap_err().to_string()
-    };
-    assert!(message(norm, -2.0).contains("cannot be undone at the edge of the image"), "{}", message(norm, -2.0));
-    assert!(message(IntrinsicsNorm { cx: 1.2, ..norm }, 0.01).contains("lies outside of the image"));
-    assert!(message(norm, f64::INFINITY).contains("k1 is inf"));
+    let lens = Lens { radial: [0.01, 0.0, 0.0, 0.0, 0.0, 0.0], ..Lens::default() };
+    let message = Undistortion::new(IntrinsicsNorm { cx: 1.2, ..norm }, lens).unwrap_err().to_string();
+    assert!(message.contains("lies outside of the image"), "{message}");
 }

@@ -14,7 +14,8 @@ use std::path::Path;
 use clift_data::{DatasetRoot, FileOptions, OpenedSource, SkipReport, SourceOptions, Split, open_source};
 
 fn open(root: &Path, split: Split, options: &SourceOptions) -> Result<OpenedSource, String> {
-    DatasetRoot::find(root).and_then(|root| open_source(&root, split, options)).map_err(|error| error.to_string())
+    let opened = DatasetRoot::find(root).and_then(|root| open_source(&root, split, options, &mut |_, _| ()));
+    opened.map_err(|error| error.to_string())
 }
 
 fn open_test(root: &Path) -> Result<OpenedSource, String> {

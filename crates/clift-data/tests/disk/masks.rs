@@ -1,7 +1,6 @@
 //! Masks and alpha channels of captures.
 
 use std::fs;
-use std::path::Path;
 
 use clift_core::{PoseRotation, PoseScale, RgbImage};
 use clift_data::{ClipOptions, ClipReader, OpenedSource, SourceOptions, Split, ViewIndices, encode_png};
@@ -9,15 +8,10 @@ use image::{ImageFormat, RgbaImage};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::files::{copy_of_layout, frame_at, write_capture};
+use crate::files::{copy_of_layout, frame_at, gray, write_capture};
 use crate::{open_test, skipped_frames};
 
 const SIZE: [usize; 2] = [24, 16];
-
-/// Returns the PNG of an image of gray 200.
-fn gray() -> Vec<u8> {
-    encode_png(&RgbImage { width: SIZE[0], height: SIZE[1], rgb: vec![200; SIZE[0] * SIZE[1] * 3] }).unwrap()
-}
 
 /// Returns the PNG of a mask whose left half is black, and whose other pixels are `level`.
 fn mask(level: u8) -> Vec<u8> {
@@ -28,7 +22,7 @@ fn mask(level: u8) -> Vec<u8> {
 /// Writes files beside `images/{a,b,c}.png` and opens the capture.
 fn capture(files: &[(&str, Vec<u8>)], keys: &Value) -> (TempDir, OpenedSource) {
     let root = tempfile::tempdir().unwrap();
-    let mut images: Vec<_> = ["images/a.png", "images/b.png", "images/c.png"].map(|name| (name, gray())).into();
+    let mut images: Vec<_> = ["images/a.png", "images/b.png", "images/c.png"].map(|name| (name, gray(24, 200))).into();
     images.extend(files.iter().cloned());
     let mut frames = [0.0, 1.0, 2.0].map(|x| frame_at(x, ["images/a.png", "images/b.png", "images/c.png"][x as usize]));
     frames[0].as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
@@ -75,7 +69,6 @@ fn clips_have_weights_of_targets_where_a_target_has_a_mask() {
         height: 16,
         pose_rotation: PoseRotation::Quaternion,
         pose_scale: PoseScale::Context,
-        exact_principal_point: false,
     };
     let reader = ClipReader { source: opened.source, options };
     let read = |context: &[usize], target: &[usize]| {
@@ -86,13 +79,11 @@ fn clips_have_weights_of_targets_where_a_target_has_a_mask() {
     // Four columns are cropped on each side: eight of sixteen count.
     let expected = [vec![255; 256], [[0; 8], [255; 8]].concat().repeat(16)].concat();
     assert_eq!(clip.target_weights, Some(expected.clone()));
-    let mirrored = [vec![255; 256], [[255; 8], [0; 8]].concat().repeat(16)].concat();
-    assert_eq!(clip.flipped().target_weights, Some(mirrored));
     let half = [vec![255; 64], [[0; 4], [255; 4]].concat().repeat(8)].concat();
     assert_eq!(clip.at_half_resolution().target_weights, Some(half));
     let white = SourceOptions { background: [255; 3], ..SourceOptions::default() };
     let root = clift_data::DatasetRoot::find(root.path()).unwrap();
-    let opened = clift_data::open_source(&root, Split::Test, &white).unwrap();
+    let opened = clift_data::open_source(&root, Split::Test, &white, &mut |_, _| ()).unwrap();
     assert_eq!(opened.source.frame(0, 0).unwrap().rgb[0], 255);
 }
 
@@ -116,12 +107,4 @@ fn masks_of_colmap_are_turned_with_the_lens_and_bad_ones_are_named() {
     fs::write(masks.join("frame 8.png.png"), black(40)).unwrap();
     let message = opened.source.frame(0, 0).unwrap_err().to_string();
     assert!(message.contains("40x9 pixels, the image has 32x18") && message.ends_with("frame 8.png.png"), "{message}");
-}
-
-#[test]
-fn frames_without_the_mask_that_they_name_are_skipped() {
-    let (root, opened) = capture(&[], &json!({"mask_path": "masks/none.png"}));
-    assert!(Path::new(root.path()).exists());
-    let [(name, reason)] = skipped_frames(&opened.report)[..] else { panic!("{}", opened.report) };
-    assert_eq!((name, reason), ("images/a.png", "without the mask of its mask_path"));
 }

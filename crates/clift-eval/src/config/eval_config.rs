@@ -1,11 +1,10 @@
 //! The `[eval]` section of a config.
 
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use clift_model::{Precision, TokenCount};
 use clift_scene::TokenCoding;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::config::token_selection::Selection;
@@ -24,9 +23,8 @@ pub struct EvalConfig {
     /// Rendered methods of `random`, `tile`, `tile_clift`, `kmeans`, `clift` and `lvsm_ed`; empty for all methods with
     /// weights.
     pub methods: Vec<Method>,
-    /// Formats of the stored tokens, as in a scene file: one of `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss as
-    /// measured when the codec was fitted) and `coded-DB`, or a list of them to compare.
-    #[serde(deserialize_with = "one_or_more")]
+    /// Formats of the stored tokens, as in a scene file, to compare: `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss
+    /// as measured when the codec was fitted) and `coded-DB`.
     pub formats: Vec<TokenCoding>,
     /// LPIPS weights, converted by `scripts/tools/convert_vgg.py`. LPIPS is not measured without weights.
     pub lpips_weights: Option<PathBuf>,
@@ -88,26 +86,6 @@ impl EvalConfig {
     }
 }
 
-/// Reads a format or a list of formats, without duplicates.
-fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenCoding>, D::Error> {
-    #[derive(Deserialize)]
-    #[serde(untagged, expecting = "a format (\"f32\", \"f16\", \"int8\", \"coded\") or a list of them")]
-    enum Written {
-        One(TokenCoding),
-        More(Vec<TokenCoding>),
-    }
-    let mut formats = match Written::deserialize(deserializer)? {
-        Written::One(format) => vec![format],
-        Written::More(formats) => formats,
-    };
-    let mut seen = BTreeSet::new();
-    formats.retain(|format| seen.insert(*format));
-    if formats.is_empty() {
-        return Err(serde::de::Error::custom("at least one format is needed"));
-    }
-    Ok(formats)
-}
-
 impl Default for EvalConfig {
     fn default() -> Self {
         // The shares of the paper's main experiment.
@@ -138,15 +116,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn formats_are_a_name_or_a_list() {
-        let formats = |text: &str| serde_json::from_str::<EvalConfig>(text).map(|config| config.formats);
-        assert_eq!(formats(r#"{"formats": "f16"}"#).unwrap(), [TokenCoding::F16]);
-        assert_eq!(formats(r#"{"formats": ["int8", "f32", "int8"]}"#).unwrap(), [TokenCoding::INT8, TokenCoding::F32]);
-        assert!(formats(r#"{"formats": []}"#).unwrap_err().to_string().contains("at least one"));
-        assert!(formats(r#"{"formats": "f64"}"#).unwrap_err().to_string().contains("int8"));
-    }
-
-    #[test]
     fn render_counts_are_distinct_and_below_storage() {
         let (count, share) = (TokenCount::Count, TokenCount::Share);
         let render = vec![count(16), share(0.5), count(64), share(1.0), count(4)];
@@ -155,12 +124,5 @@ mod tests {
         for (num_storage_tokens, expected) in cases {
             assert_eq!(eval.render_counts(num_storage_tokens), expected);
         }
-    }
-
-    #[test]
-    fn empty_paths_mean_no_weights() {
-        let config = |path: &str| EvalConfig { lpips_weights: Some(path.into()), ..EvalConfig::default() };
-        assert_eq!(config("").lpips_path(), None);
-        assert_eq!(config("a").lpips_path(), Some(Path::new("a")));
     }
 }

@@ -1,16 +1,11 @@
-//! Rendering methods: own methods, two baselines, and external methods by name.
+//! Rendering methods and two baselines.
 
 use std::str::FromStr;
 
-use arrayvec::ArrayString;
 use clift_model::{Architecture, Grouping};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::EvalError;
-
-const MAX_NAME: usize = 40;
-/// Most bytes of a character in UTF-8.
-const MAX_CHAR_BYTES: usize = 4;
 
 /// A method that makes images of target views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, strum::IntoStaticStr)]
@@ -32,8 +27,6 @@ pub enum Method {
     NearestView,
     /// Baseline: the mean of the context views.
     MeanImage,
-    /// Images of a method of another program.
-    External(MethodName),
 }
 
 impl Method {
@@ -60,7 +53,6 @@ impl Method {
     /// Returns the name in files and tables.
     pub fn name(&self) -> &str {
         match self {
-            Self::External(name) => name.as_str(),
             Self::Whole(architecture) => architecture.method_name(),
             own => (*own).into(),
         }
@@ -71,7 +63,7 @@ impl Method {
         match self {
             Self::Clift | Self::Kmeans => Some(Grouping::Kmeans),
             Self::TileClift | Self::Tile => Some(Grouping::Tile),
-            Self::Random | Self::Whole(_) | Self::NearestView | Self::MeanImage | Self::External(_) => None,
+            Self::Random | Self::Whole(_) | Self::NearestView | Self::MeanImage => None,
         }
     }
 
@@ -89,35 +81,15 @@ impl Method {
     }
 }
 
-/// Name of an external method, in place: a [`Method`] is copied as often as a number.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct MethodName(ArrayString<{ MAX_NAME * MAX_CHAR_BYTES }>);
-
-impl MethodName {
-    /// Checks a name: 1 to 40 printable characters, not the name of an own method.
-    pub fn new(name: &str) -> Result<Self, EvalError> {
-        let bad = |reason: &str| EvalError::BadMethodName { name: name.into(), reason: reason.into() };
-        if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {
-            return Err(bad("use 1 to 40 printable characters"));
-        }
-        if Method::own().any(|own| own.name() == name) {
-            return Err(bad("reserved for a method of clift; choose another name"));
-        }
-        ArrayString::from(name).map(Self).map_err(|_| bad("use 1 to 40 printable characters"))
-    }
-
-    /// Returns the name.
-    pub fn as_str(&self) -> &str {
-        self.0.as_str()
-    }
-}
-
 impl FromStr for Method {
     type Err = EvalError;
 
     fn from_str(name: &str) -> Result<Self, EvalError> {
         let own = Self::own().find(|method| method.name() == name);
-        own.map_or_else(|| MethodName::new(name).map(Self::External), Ok)
+        own.ok_or_else(|| {
+            let names = Self::own().map(|method| method.name().to_owned()).collect::<Vec<_>>().join(", ");
+            EvalError::BadMethodName { name: name.into(), names }
+        })
     }
 }
 
@@ -138,27 +110,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_printable_and_not_reserved() {
-        for name in ["", " ", "clift", "kmeans", "a\nb", &"x".repeat(41)] {
-            assert!(MethodName::new(name).is_err(), "{name:?}");
-        }
-        let name = MethodName::new("LVSM (2 views)").unwrap();
-        assert_eq!(name, MethodName::new("LVSM (2 views)").unwrap());
-        assert!(MethodName::new("LVSM").unwrap() < name);
-        assert_eq!(MethodName::new(&"\u{1f600}".repeat(40)).unwrap().as_str().chars().count(), 40);
-        assert_eq!(name.as_str(), "LVSM (2 views)");
-    }
-
-    #[test]
     fn names_are_equal_in_json_and_csv() {
-        let other = Method::External(MethodName::new("MVSplat").unwrap());
-        for method in Method::own().chain([other]) {
+        for method in Method::own() {
             assert_eq!(serde_json::to_value(method).unwrap(), method.name());
             assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
         }
         let own: Vec<Method> = Method::own().collect();
         let names: Vec<&str> = own.iter().map(Method::name).collect();
         assert_eq!(names[3..7], ["tile_clift", "random", "lvsm_ed", "nearest_view"]);
-        assert!(serde_json::from_value::<Method>("".into()).is_err());
+        let message = serde_json::from_value::<Method>("lvsm".into()).unwrap_err().to_string();
+        assert!(message.contains("unknown method `lvsm`; write one of clift, kmeans, tile, tile_clift"), "{message}");
     }
 }

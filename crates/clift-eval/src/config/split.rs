@@ -113,17 +113,4 @@ mod tests {
             EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 8 }.views(&rooms(10), 0, 4, 3).unwrap().unwrap();
         assert_eq!(few.target, [0, 8], "as many as there are");
     }
-
-    #[test]
-    fn index_with_a_training_frame_measures_training_scenes() {
-        let held_out = EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 4 };
-        let of = |frames: EvalFrames, target: &[usize]| {
-            let views = ViewIndices { context: vec![1, 2], target: target.to_vec() };
-            let source = SyntheticSource::new(SyntheticConfig::default()).unwrap();
-            frames.of_views(&source, &[EvaluationItem { scene: 0, views }])
-        };
-        assert_eq!(of(held_out, &[0, 4]), EvalSplit::HeldOutFrames);
-        assert_eq!(of(held_out, &[0, 5]), EvalSplit::Train);
-        assert_eq!(of(EvalFrames::whole(EvalSplit::Test), &[0, 5]), EvalSplit::Test);
-    }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clift_core::replace_file;
-use clift_data::{ClipReader, EvaluationItem, SkipReport, SkippedScene, plural};
+use clift_data::{ClipReader, EvaluationItem, SkipReport, plural};
 use clift_model::{Architecture, LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, ModelError};
 use clift_scene::TokenCoding;
 
@@ -14,17 +14,16 @@ use crate::config::method::Method;
 use crate::config::split::{EvalFrames, EvalSplit};
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
-use crate::evaluator::progress::{EvalProgress, SharedScenes};
+use crate::evaluator::progress::EvalProgress;
 use crate::evaluator::sheets::Sheets;
-use crate::figures::scene_figure::SceneFigures;
+use crate::figures::canvas::Canvas;
+use crate::figures::contact_sheet::contact_sheet;
 use crate::report::page::{MAX_FIGURES, Report, RunDescription};
-use crate::report::training::TrainingCurve;
 use crate::statistics::csv_files::{write_scenes, write_views};
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::summary::{Summary, context_targets_note};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
-use crate::sweep::predictions::{ExternalMethod, image_name};
 use crate::sweep::sweep::Sweep;
 
 /// Smallest number of timed views of a point: quartiles of fewer mean little.
@@ -46,12 +45,8 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
-    /// Chooses the scenes and views of `sweep.eval` from the `frames` of `reader`. [`evaluate`](Self::evaluate) adds LPIPS and
-    /// external methods to `sweep`.
-    ///
-    /// # Errors
-    /// As [`evaluation_items`]; [`ModelError::BadConfig`] for a token count above the tokens of a scene, or a precision that
-    /// the device does not have.
+    /// Chooses the scenes and views of `sweep.eval` from the `frames` of `reader`. [`evaluate`](Self::evaluate) adds LPIPS
+    /// to `sweep`.
     pub fn new(
         sweep: Sweep,
         description: RunDescription,
@@ -84,19 +79,15 @@ impl Evaluator {
         (text, self.split.warning().map(str::to_owned).into_iter().chain(context_targets_note(num_given)).collect())
     }
 
-    /// Measures every scene, shared with other processes by `progress`. The first process writes `report.html`,
-    /// `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the contact sheets to `folder`. Scores the images of
-    /// `external_methods` too. The report has the curves of `training`.
+    /// Measures every scene, and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
+    /// contact sheets to `folder`.
     ///
     /// # Errors
     /// As [`measure`](Self::measure), [`ModelError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a
-    /// method without weights, [`EvalError::NoScenes`] when every scene failed, [`EvalError::NoPredictions`] for an external
-    /// method without any image, and [`EvalError::Io`].
+    /// method without weights, [`EvalError::NoScenes`] when every scene failed, and [`EvalError::Io`].
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        external_methods: &[ExternalMethod],
-        training: Vec<TrainingCurve>,
         folder: &Path,
         progress: &mut dyn EvalProgress,
     ) -> Result<Summary, EvalError> {
@@ -105,24 +96,23 @@ impl Evaluator {
         let sweep = Sweep {
             eval: EvalConfig { methods, formats, ..self.sweep.eval.clone() },
             lpips: lpips.clone().ok(),
-            external_methods: external_methods.to_vec(),
             min_timed_views: MIN_TIMED_VIEWS,
             ..self.sweep.clone()
         };
         progress.done(0, self.items.len());
-        let is_writer = progress.process().rank == 0;
-        let sheets = is_writer.then(|| Sheets::new(folder)).transpose()?;
-        let mut figures = Vec::new();
-        let mut keep_figures = |key: &str, scene: SceneFigures| {
-            if figures.len() < MAX_FIGURES {
-                figures.push(scene.figure);
+        let sheets = Sheets::new(folder)?;
+        let mut shown = Vec::new();
+        let mut keep_sheet = |key: &str, sheet: Canvas| {
+            sheets.add(&sheet, key)?;
+            if shown.len() < MAX_FIGURES {
+                shown.push((key.to_owned(), sheet));
             }
-            sheets.as_ref().map_or(Ok(()), |sheets| sheets.add(&scene.contact_sheet, key))
+            Ok(())
         };
-        let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.sweep.eval.num_sheets };
-        let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
+        let limits = SceneLimits { num_scenes: self.items.len(), num_sheets: self.sweep.eval.num_sheets };
+        let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_sheet, progress)?;
         match &lpips {
-            Ok(lpips) => measured.lpips_sha256 = Some(lpips.sha256().into()),
+            Ok(lpips) => measured.facts.lpips_weights_sha256 = Some(lpips.sha256().into()),
             Err(reason) => measured.note_not_measured("lpips_vgg", reason.clone()),
         }
         let summary = Summary::new(&measured);
@@ -131,10 +121,6 @@ impl Evaluator {
             let reason = format!("every scene of the evaluation failed{}", first.unwrap_or_default());
             return Err(EvalError::NoScenes { reason });
         }
-        for external in external_methods {
-            self.require_images(external, &summary)?;
-        }
-        let Some(sheets) = sheets else { return Ok(summary) };
         let complete = folder.join("summary.json");
         // Last: an evaluation with a summary is complete. That of a former evaluation goes first.
         if complete.exists() {
@@ -144,78 +130,51 @@ impl Evaluator {
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
         write_skip_report(&skipped, &folder.join("skipped.json"))?;
-        let report = Report { run: self.description.clone(), summary: summary.clone(), training, skipped, figures };
+        let report = Report { run: self.description.clone(), summary: summary.clone(), skipped, sheets: shown };
         report.write(&folder.join("report.html"))?;
         summary.write(&complete)?;
         Ok(summary)
     }
 
-    /// Measures the first scenes with `sweep`, shared with other processes by `progress`, and passes figures of the first
-    /// scenes to `keep_figures` of the first process. Returns the metrics, and the scenes whose views could not be chosen or
-    /// read, of all processes.
+    /// Measures the first scenes with `sweep`, and passes the contact sheets of the first of them to `keep_sheet`. Returns
+    /// the metrics, and the scenes whose views could not be chosen or read.
     ///
     /// # Errors
-    /// [`EvalError::Interrupted`] when `progress` requests a stop; as [`evaluate_scene`] and `keep_figures`.
+    /// [`EvalError::Interrupted`] when `progress` requests a stop; as `evaluate_scene` and `keep_sheet`.
     pub fn measure(
         &self,
         models: &EvalModels,
         sweep: &Sweep,
         limits: SceneLimits,
-        keep_figures: &mut dyn FnMut(&str, SceneFigures) -> Result<(), EvalError>,
+        keep_sheet: &mut dyn FnMut(&str, Canvas) -> Result<(), EvalError>,
         progress: &mut dyn EvalProgress,
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.sweep.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
-        measured.split = Some(self.split);
-        measured.training_scenes.clone_from(&self.training_scenes);
+        measured.facts.split = Some(self.split);
+        measured.facts.training_scenes.clone_from(&self.training_scenes);
         measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
-        let process = progress.process();
-        let mut own = SharedScenes::default();
         for (i, item) in self.items.iter().take(total).enumerate() {
             if progress.is_interrupted() {
-                own.interrupted_at = Some(i);
-                break;
-            }
-            if !process.measures(i, limits.num_figures) {
-                continue;
+                return Err(EvalError::Interrupted { done: i, total });
             }
             let key = self.reader.source.key(item.scene);
             match self.reader.read(item.scene, &item.views) {
                 Ok(clip) => {
-                    let keep_images = i < limits.num_figures;
-                    if let Some(results) = evaluate_scene(models, &clip, sweep, keep_images, &mut own.results)? {
-                        keep_figures(key, SceneFigures::new(&clip, &results, sweep.model.patch_size)?)?;
+                    let keep_images = i < limits.num_sheets;
+                    if let Some(results) = evaluate_scene(models, &clip, sweep, keep_images, &mut measured)? {
+                        keep_sheet(key, contact_sheet(&clip, &results)?)?;
                     }
                 }
                 Err(error) => {
                     let reason = error.to_string();
                     progress.skipped(key, &reason);
-                    own.skipped.push((i, SkippedScene { key: key.into(), reason }));
+                    measured.skipped.insert(key.into());
+                    skip_report.skip(key, reason);
                 }
             }
             progress.done(i + 1, total);
-        }
-        let mut skipped = Vec::new();
-        for (rank, part) in progress.gather(own)?.into_iter().enumerate() {
-            if let Some(done) = part.interrupted_at {
-                return Err(EvalError::Interrupted { done, total });
-            }
-            measured.merge(part.results);
-            for (i, skip) in part.skipped {
-                if rank != process.rank {
-                    progress.skipped(&skip.key, &skip.reason);
-                }
-                skipped.push((i, skip));
-            }
-        }
-        skipped.sort_by_key(|(i, _)| *i);
-        for (_, SkippedScene { key, reason }) in skipped {
-            measured.skipped.insert(key.clone());
-            skip_report.skip(key, reason);
-        }
-        if process.count > 1 {
-            progress.done(total, total);
         }
         Ok((measured, skip_report))
     }
@@ -252,19 +211,6 @@ impl Evaluator {
         })
     }
 
-    /// Refuses an external method without any image: probably a wrong path.
-    fn require_images(&self, external: &ExternalMethod, summary: &Summary) -> Result<(), EvalError> {
-        if summary.points.iter().any(|point| point.key.method == external.key().method) {
-            return Ok(());
-        }
-        let first = self.items.first().and_then(|item| {
-            let frame = item.views.target.first()?;
-            Some(image_name(self.reader.source.key(item.scene), *frame))
-        });
-        let (name, first, path) = (external.name.as_str().into(), first.unwrap_or_default(), external.folder.clone());
-        Err(EvalError::NoPredictions { name, expected: summary.num_views, first, path })
-    }
-
     /// Returns the methods of the config, or all methods with weights. Networks without clusters
     /// beside the run are always measured.
     fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
@@ -298,13 +244,13 @@ impl Evaluator {
     }
 }
 
-/// Numbers of measured scenes and of scenes with figures.
+/// Numbers of measured scenes and of scenes with contact sheets.
 #[derive(Clone, Copy, Debug)]
 pub struct SceneLimits {
     /// Number of measured scenes, from the first.
     pub num_scenes: usize,
-    /// Number of scenes with figures, from the first.
-    pub num_figures: usize,
+    /// Number of scenes with contact sheets, from the first.
+    pub num_sheets: usize,
 }
 
 /// Refuses storage counts above `fewest_tokens`, the smallest scene, and render counts that no scene would use: a network

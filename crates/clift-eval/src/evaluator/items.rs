@@ -11,9 +11,6 @@ use crate::error::EvalError;
 ///
 /// Takes at most `eval.num_scenes` scenes (0: all), in the order of the index or the source. Unusable scenes are in the skip
 /// report.
-///
-/// # Errors
-/// [`EvalError::Data`] for an index that cannot be read, and [`EvalError::NoScenes`] when no scene is left.
 pub fn evaluation_items(
     eval: &EvalConfig,
     reader: &ClipReader,

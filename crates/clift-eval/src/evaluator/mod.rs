@@ -1,8 +1,8 @@
 //! A complete evaluation and its files.
 //!
 //! - `items`: scenes and views to evaluate
-//! - `progress`: progress, and the processes that share the scenes
-//! - `sheets`: contact sheets on disk
+//! - `progress`: receiver of progress
+//! - `sheets`: contact sheets on disk, and file names of scenes
 //! - `evaluator`: measure a model, write the results
 
 pub(crate) mod evaluator;

@@ -2,196 +2,137 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clift_scene::TokenCoding;
+use clift_scene::{CodedLoss, TokenCoding};
 
 use crate::config::method::Method;
-use crate::report::axis::{Scale, milliseconds};
-use crate::report::plot::{Level, Look, Mark, Plot, Series};
-use crate::statistics::summary::{Quality, Summary, SummaryPoint};
-use crate::statistics::view_metrics::EvalKey;
+use crate::report::plot::{Mark, Plot, Series};
+use crate::statistics::summary::{Summary, SummaryPoint};
 
-/// Returns the plots that a summary has values for.
+const METHODS: [Method; 5] = [Method::Clift, Method::Kmeans, Method::Random, Method::Tile, Method::TileClift];
+
 pub fn plots(summary: &Summary) -> Vec<Plot> {
     let has = |test: fn(&SummaryPoint) -> bool| summary.points.iter().any(test);
+    let whole = |x: fn(&SummaryPoint) -> Option<f64>| {
+        move |point: &SummaryPoint| if point.key.is_whole() { x(point) } else { None }
+    };
+    let plot = |heading, x_label, series: Vec<Series>| Plot {
+        heading,
+        x_label,
+        is_log: true,
+        series,
+        levels: levels(summary),
+        note: String::new(),
+    };
     let stored = |point: &SummaryPoint| Some(point.key.num_storage_tokens as f64).filter(|count| *count > 0.0);
-    let mut plots = vec![Plot {
-        heading: "Quality against stored tokens",
-        ..by_method(summary, "stored tokens", Scale::LogValues, stored)
-    }];
+    let mut plots =
+        vec![plot("Quality against stored tokens", "stored tokens", series(summary, true, whole(stored), |_| false))];
     if has(|point| point.key.is_whole() && point.cost.scene_bytes.is_some()) {
-        let kb = |point: &SummaryPoint| point.cost.scene_kb();
-        plots.push(Plot {
-            heading: "Quality against the size of a scene",
-            note: "Sizes are those of the evaluated formats. Coded tokens, which clift encode writes by default, take a \
-                   fraction of them: eval --format f32,coded measures both.",
-            front: front(summary, |point| point.pareto_bytes, kb),
-            ..by_method(summary, "scene, kB", Scale::Log, kb)
-        });
+        let kb = |point: &SummaryPoint| point.cost.scene_bytes.map(|bytes| bytes as f64 / 1e3);
+        let mut lines = series(summary, true, whole(kb), |point| point.pareto_bytes);
+        let coded = coded_series(summary);
+        let note = if coded.is_some() {
+            format!(
+                "Sizes in the formats of the evaluation, and of the default format of clift encode, coded tokens, at the \
+                 PSNR of plain ones: coding lost at most {} dB where the codec was fitted. Rings: the Pareto front.",
+                CodedLoss::default().db()
+            )
+        } else {
+            "Sizes in the formats of the evaluation. Rings: the Pareto front.".into()
+        };
+        lines.extend(coded);
+        plots.push(Plot { note, ..plot("Quality against the size of a scene", "scene, kB", lines) });
     }
     // Of one network, values are tokens and work is nearly linear in them.
     if has(|point| point.key.method.network().is_some()) && has(|point| point.key.method == Method::Clift) {
         let values = |point: &SummaryPoint| point.cost.scene_values.map(|count| count as f64);
         let gmac = |point: &SummaryPoint| point.cost.gflops;
-        plots.push(Plot {
-            heading: "Quality against stored values",
-            ..by_method(summary, "stored values", Scale::LogValues, values)
-        });
-        plots.push(Plot {
-            heading: "Quality against the work of a view",
-            ..by_method(summary, "GMAC per view", Scale::Log, gmac)
-        });
+        let (values, gmac) =
+            (series(summary, true, whole(values), |_| false), series(summary, true, whole(gmac), |_| false));
+        plots.push(plot("Quality against stored values", "stored values", values));
+        plots.push(plot("Quality against the work of a view", "GMAC per view", gmac));
     }
     if has(|point| !point.key.is_whole()) {
-        plots.push(by_rendered(summary));
+        let note = "The last mark of a line is rendered from all stored tokens.".into();
+        plots.push(Plot { note, ..plot("Quality against rendered tokens", "rendered tokens", by_stored(summary)) });
     }
     if has(|point| point.frame_median_s.is_some()) {
-        plots.push(by_time(summary));
+        let frame_ms = |point: &SummaryPoint| Some(point.frame_median_s? * 1e3);
+        let lines = series(summary, false, frame_ms, |point| point.pareto_time);
+        let note = "Medians over views, each rendered in a call of its own; includes token selection. Rings: the Pareto \
+                    front.";
+        let plot = plot("Quality against time per frame", "time per frame, ms", lines);
+        plots.push(Plot { is_log: false, note: note.into(), ..plot });
     }
     plots
 }
 
-/// Returns the look of a method, the same in every plot.
-fn look(summary: &Summary, method: Method) -> Look {
-    match method {
-        Method::Clift => Look::ALL[0],
-        Method::Kmeans => Look::ALL[1],
-        Method::Random => Look::ALL[2],
-        Method::Tile => Look::ALL[3],
-        // Baselines are levels, not series.
-        Method::TileClift | Method::NearestView | Method::MeanImage => Look::ALL[4],
-        Method::Whole(_) | Method::External(_) => {
-            let is_other = |method: &Method| matches!(method, Method::Whole(_) | Method::External(_));
-            let methods = summary.points.iter().map(|point| point.key.method);
-            let others: BTreeSet<_> = methods.filter(is_other).collect();
-            let index = others.into_iter().position(|other| other == method).unwrap_or_default();
-            Look::OTHERS[index % Look::OTHERS.len()]
-        }
-    }
-}
-
-/// Returns whether stored tokens have several number formats, which then have lines of their own.
-fn has_formats(summary: &Summary) -> bool {
+/// Returns a series per method, and per format where the stored tokens have several.
+fn series(
+    summary: &Summary,
+    is_joined: bool,
+    x: impl Fn(&SummaryPoint) -> Option<f64>,
+    is_front: fn(&SummaryPoint) -> bool,
+) -> Vec<Series> {
     let stored = summary.points.iter().filter(|point| point.cost.scene_bytes.is_some());
-    stored.filter_map(|point| point.key.tokens).collect::<BTreeSet<_>>().len() > 1
-}
-
-fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&SummaryPoint) -> Option<Mark>) -> Vec<Series> {
-    let has_formats = has_formats(summary);
-    let formats: BTreeSet<TokenCoding> = summary.points.iter().filter_map(|point| point.key.tokens).collect();
+    let formats: BTreeSet<Option<TokenCoding>> = stored.map(|point| point.key.tokens).collect();
+    let others: BTreeSet<Method> = summary.points.iter().map(|point| point.key.method).collect();
+    let methods: Vec<Method> = METHODS.into_iter().chain(others.into_iter().filter(|m| !METHODS.contains(m))).collect();
     let mut lines: BTreeMap<(Method, Option<TokenCoding>), Vec<Mark>> = BTreeMap::new();
     for point in &summary.points {
-        if let Some(mark) = mark(point) {
-            lines.entry((point.key.method, point.key.tokens.filter(|_| has_formats))).or_default().push(mark);
+        if let Some(mark) = x(point).and_then(|x| mark(point, x, is_front(point))) {
+            let format = point.key.tokens.filter(|_| formats.len() > 1 && point.key.method != Method::Random);
+            lines.entry((point.key.method, format)).or_default().push(mark);
         }
     }
-    let line = |((method, tokens), marks): ((Method, Option<TokenCoding>), Vec<Mark>)| {
-        let mut look = look(summary, method);
-        let mut name = method.name().to_owned();
-        if let Some(tokens) = tokens.filter(|_| method != Method::Random) {
-            // Colour of the method, marker of the format.
-            let format = formats.iter().position(|format| *format == tokens).unwrap_or_default();
-            look.marker = Look::ALL[format % Look::ALL.len()].marker;
-            name = format!("{name}, {tokens}");
-        }
-        Series { name, look, is_joined, marks }
+    let line = |((method, format), marks): ((Method, Option<TokenCoding>), Vec<Mark>)| {
+        let colour = methods.iter().position(|one| *one == method).unwrap_or_default();
+        let of_format = formats.iter().position(|one| *one == format).filter(|_| format.is_some());
+        let name = [method.name().to_owned()].into_iter().chain(format.map(|format| format.to_string()));
+        let name = name.collect::<Vec<_>>().join(", ");
+        Series { name, look: [colour, of_format.unwrap_or(colour)], is_joined, marks }
     };
     lines.into_iter().map(line).collect()
 }
 
-fn levels(summary: &Summary) -> Vec<Level> {
-    let baselines = summary.baselines;
-    let all = [("nearest view", "nearest", baselines.nearest_view), ("mean image", "mean", baselines.mean_image)];
-    let level = |(name, class, quality): (&str, _, Quality)| Some(Level { name: name.into(), class, y: quality.psnr? });
-    all.into_iter().filter_map(level).collect()
-}
-
-/// Returns the mark of a point at `x`; `None` without PSNR.
-fn mark(point: &SummaryPoint, x: f64) -> Option<Mark> {
-    let y = point.quality.psnr?;
-    let EvalKey { num_storage_tokens: stored, num_render_tokens: rendered, .. } = point.key;
-    let tokens = match (stored, point.key.is_whole()) {
-        (0, _) => String::new(),
-        (_, true) => format!(", {stored} tokens"),
-        (_, false) => format!(", {rendered} of {stored} tokens"),
-    };
-    let format = point.key.tokens.map(|tokens| format!(" in {tokens}")).unwrap_or_default();
-    let error = point.psnr_stderr.map(|error| format!(" \u{b1} {error:.2}")).unwrap_or_default();
-    let time = point.frame_median_s.map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
-    let title = format!("{}{tokens}{format}: {y:.2}{error} dB{time}", point.key.method.name());
-    Some(Mark { x, y, error: point.psnr_stderr, title })
-}
-
-/// Plots a line per method over the points that render all stored tokens.
-fn by_method(
-    summary: &Summary,
-    x_label: &'static str,
-    x_scale: Scale,
-    x: impl Fn(&SummaryPoint) -> Option<f64>,
-) -> Plot {
-    let whole = |point: &SummaryPoint| if point.key.is_whole() { x(point).and_then(|x| mark(point, x)) } else { None };
-    Plot {
-        title: format!("PSNR against {x_label}, a line per method, with the standard error over scenes"),
-        x_label,
-        x_scale,
-        series: series(summary, true, whole),
-        levels: levels(summary),
-        ..Plot::default()
+/// Returns the sizes in the default format of `clift encode`, where the evaluation has not measured this format.
+fn coded_series(summary: &Summary) -> Option<Series> {
+    let default = Some(TokenCoding::Coded(CodedLoss::default()));
+    if summary.points.iter().any(|point| point.key.tokens == default) {
+        return None;
     }
+    let points = summary.best_points().filter(|point| point.key.is_whole());
+    let marks: Vec<Mark> =
+        points.filter_map(|point| mark(point, point.cost.coded_bytes? as f64 / 1e3, false)).collect();
+    let name = "clift, coded: the default of clift encode".into();
+    (!marks.is_empty()).then_some(Series { name, look: [7, 4], is_joined: true, marks })
 }
 
-/// Plots a line per storage count of the best method.
-fn by_rendered(summary: &Summary) -> Plot {
+/// Returns a series per number of stored tokens of the main method, over rendered tokens.
+fn by_stored(summary: &Summary) -> Vec<Series> {
     let mut lines: BTreeMap<usize, Vec<Mark>> = BTreeMap::new();
+    // By ascending rendered tokens, as all points.
     for point in summary.best_points() {
-        lines.entry(point.key.num_storage_tokens).or_default().extend(mark(point, point.key.num_render_tokens as f64));
+        let x = point.key.num_render_tokens as f64;
+        lines.entry(point.key.num_storage_tokens).or_default().extend(mark(point, x, false));
     }
     lines.retain(|_, marks| marks.len() > 1);
-    for marks in lines.values_mut() {
-        marks.sort_by(|a, b| a.x.total_cmp(&b.x));
-    }
-    // With more lines than looks, the largest counts.
-    let surplus = lines.len().saturating_sub(Look::ALL.len());
-    let series = lines.into_iter().skip(surplus).rev().zip(Look::ALL).map(|((stored, marks), look)| Series {
+    let line = |(i, (stored, marks)): (usize, _)| Series {
         name: format!("{stored} stored"),
-        look,
+        look: [i, i],
         is_joined: true,
         marks,
-    });
-    Plot {
-        heading: "Quality against rendered tokens",
-        title: "PSNR against rendered tokens, a line per number of stored tokens".into(),
-        x_label: "rendered tokens",
-        x_scale: Scale::LogValues,
-        series: series.collect(),
-        levels: levels(summary),
-        note: "The last mark of a line is rendered from all stored tokens.",
-        ..Plot::default()
-    }
+    };
+    lines.into_iter().rev().enumerate().map(line).collect()
 }
 
-/// Plots every point over its time per frame, and the Pareto front.
-fn by_time(summary: &Summary) -> Plot {
-    let frame_ms = |point: &SummaryPoint| Some(point.frame_median_s? * 1e3);
-    let at_time = |point: &SummaryPoint| Some(Mark { error: None, ..mark(point, frame_ms(point)?)? });
-    Plot {
-        heading: "Quality against time per frame",
-        title: "PSNR against time per frame: every point, with the Pareto front".into(),
-        x_label: "time per frame, ms",
-        series: series(summary, false, at_time),
-        front: front(summary, |point| point.pareto_time, frame_ms),
-        note: "Medians over views, each rendered in a call of its own; includes token selection.",
-        ..Plot::default()
-    }
+fn levels(summary: &Summary) -> Vec<(&'static str, f64)> {
+    let baselines = summary.baselines;
+    let all = [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)];
+    all.into_iter().filter_map(|(name, quality)| Some((name, quality.psnr?))).collect()
 }
 
-/// Returns the points of a Pareto front, by ascending x.
-fn front(
-    summary: &Summary,
-    is_on_front: fn(&SummaryPoint) -> bool,
-    x: impl Fn(&SummaryPoint) -> Option<f64>,
-) -> Vec<(f64, f64)> {
-    let points = summary.points.iter().filter(|point| is_on_front(point));
-    let mut front: Vec<_> = points.filter_map(|point| Some((x(point)?, point.quality.psnr?))).collect();
-    front.sort_by(|a, b| a.0.total_cmp(&b.0));
-    front
+fn mark(point: &SummaryPoint, x: f64, is_front: bool) -> Option<Mark> {
+    let y = point.quality.psnr?;
+    let time = point.frame_median_s.map_or_else(String::new, |s| format!(", {:.2} ms per frame", s * 1e3));
+    Some(Mark { x, y, error: point.psnr_stderr, is_front, title: format!("{}: {y:.2} dB{time}", point.key) })
 }

@@ -1,17 +1,17 @@
 //! Comparison of two evaluations: differences of the same views, scene by scene.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
-use clift_scene::TokenCoding;
 use serde::Serialize;
 
-use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::csv_files::read_views;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
 use crate::statistics::metric_difference::{MetricDifference, common_views};
-use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SHARPNESS, SSIM};
+use crate::statistics::text_table::table;
+use crate::statistics::view_metrics::{EvalKey, METRICS};
 
 /// The metrics of every view of an evaluation.
 #[derive(Clone, Debug)]
@@ -22,9 +22,6 @@ pub struct Evaluation {
 
 impl Evaluation {
     /// Reads `views.csv` from a run, from the folder of an evaluation, or from the path of the file.
-    ///
-    /// # Errors
-    /// [`EvalError::NotComparable`] without `views.csv`, or for a file of another format.
     pub fn read(path: &Path) -> Result<Self, EvalError> {
         let candidates = [path.join("views.csv"), path.join("eval").join("views.csv"), path.to_owned()];
         let Some(file) = candidates.into_iter().find(|candidate| candidate.is_file()) else {
@@ -39,93 +36,45 @@ impl Evaluation {
     }
 }
 
-/// One side of a comparison of methods.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MethodFilter {
-    method: Method,
-    /// The number format; `None` for any format.
-    tokens: Option<TokenCoding>,
-}
-
-impl MethodFilter {
-    /// Parses `method` or `method:format`.
-    ///
-    /// # Errors
-    /// [`EvalError::BadMethodName`], and [`EvalError::Model`] for an unknown format.
-    pub fn parse(text: &str) -> Result<Self, EvalError> {
-        let (method, tokens) = text.split_once(':').map_or((text, None), |(method, tokens)| (method, Some(tokens)));
-        Ok(Self { method: method.parse()?, tokens: tokens.map(str::parse).transpose()? })
-    }
-
-    fn matches(&self, key: EvalKey) -> bool {
-        key.method == self.method && (self.tokens.is_none() || self.tokens == key.tokens)
-    }
-}
-
-/// The differences between two keys.
+/// The differences of one key, which `a` and `b` both name.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairedRow {
-    /// Key in the first evaluation.
     pub a: EvalKey,
-    /// Key in the second evaluation.
     pub b: EvalKey,
-    /// Scenes with a common view.
     pub num_scenes: usize,
-    /// Common views.
     pub num_views: usize,
-    /// Ignored views of the first evaluation, missing in the second.
+    /// Views that the other evaluation does not have: ignored.
     pub num_only_a: usize,
-    /// Ignored views of the second evaluation, missing in the first.
     pub num_only_b: usize,
-    /// Difference of PSNR in dB; an identical image counts as 100 dB.
+    /// In dB; an identical image counts as 100 dB.
     pub psnr: Option<MetricDifference>,
-    /// Difference of SSIM.
     pub ssim: Option<MetricDifference>,
-    /// Difference of LPIPS; lower is better.
     pub lpips_vgg: Option<MetricDifference>,
-    /// Difference of sharpness.
     pub sharpness: Option<MetricDifference>,
 }
 
 /// A comparison of two evaluations.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Path of the first evaluation.
-    pub a: PathBuf,
-    /// Path of the second evaluation.
-    pub b: PathBuf,
-    /// One row per common key.
-    pub pairs: Vec<PairedRow>,
-    /// Keys of the first evaluation without a row.
-    pub only_a: Vec<EvalKey>,
-    /// Keys of the second evaluation without a row.
-    pub only_b: Vec<EvalKey>,
+    a: PathBuf,
+    b: PathBuf,
+    pairs: Vec<PairedRow>,
+    /// Keys of either evaluation without a row.
+    only_a: Vec<EvalKey>,
+    only_b: Vec<EvalKey>,
 }
 
 impl Comparison {
-    /// Compares all common keys, or one method of the first with one method of the second at equal token counts.
+    /// Compares all common keys.
     ///
     /// Differences are between the same target frames of the same scenes: means over the views of a scene, then over the
     /// scenes. Views of only one evaluation are ignored and counted.
     ///
     /// # Errors
     /// [`EvalError::NotComparable`] without a common key or without a common view.
-    pub fn new(a: &Evaluation, b: &Evaluation, sides: Option<&[MethodFilter; 2]>) -> Result<Self, EvalError> {
-        let mut pairs = Vec::new();
-        for (key_a, views_a) in a.results.views() {
-            for (key_b, views_b) in b.results.views() {
-                let matches = match sides {
-                    None => key_a == key_b,
-                    Some([side_a, side_b]) => {
-                        let counts = |key: EvalKey| (key.num_storage_tokens, key.num_render_tokens);
-                        side_a.matches(key_a) && side_b.matches(key_b) && counts(key_a) == counts(key_b)
-                    }
-                };
-                if matches {
-                    pairs.push(PairedRow::new((key_a, views_a), (key_b, views_b)));
-                }
-            }
-        }
+    pub fn new(a: &Evaluation, b: &Evaluation) -> Result<Self, EvalError> {
+        let rows = |(key, views)| Some(PairedRow::new(key, views, b.results.of(key)?));
+        let pairs: Vec<PairedRow> = a.results.views().filter_map(rows).collect();
         let not_comparable = |reason: String| EvalError::NotComparable { reason, path: b.path.clone() };
         if pairs.is_empty() {
             let keys = |of: &Evaluation| of.keys().map(|key| key.to_string()).collect::<Vec<_>>().join(", ");
@@ -146,33 +95,87 @@ impl Comparison {
                 first(b)
             )));
         }
-        // Methods that are not asked for are left out on purpose.
-        let without_row = |of: &Evaluation, side: fn(&PairedRow) -> EvalKey| -> Vec<EvalKey> {
-            let keys = of.keys().filter(|_| sides.is_none());
-            keys.filter(|key| !pairs.iter().any(|pair| side(pair) == *key)).collect()
+        let only_in = |of: &Evaluation, other: &Evaluation| -> Vec<EvalKey> {
+            of.keys().filter(|key| other.results.of(*key).is_none()).collect()
         };
-        let (only_a, only_b) = (without_row(a, |pair| pair.a), without_row(b, |pair| pair.b));
+        let (only_a, only_b) = (only_in(a, b), only_in(b, a));
         Ok(Self { a: a.path.clone(), b: b.path.clone(), pairs, only_a, only_b })
     }
 }
 
 impl PairedRow {
-    fn new((key_a, a): (EvalKey, &SceneViews), (key_b, b): (EvalKey, &SceneViews)) -> Self {
+    fn new(key: EvalKey, a: &SceneViews, b: &SceneViews) -> Self {
         let common = common_views(a, b);
         let num_views = common.iter().map(Vec::len).sum();
         let num_other = |views: &SceneViews| views.values().map(BTreeMap::len).sum::<usize>() - num_views;
+        let [psnr, ssim, lpips_vgg, sharpness] = METRICS.map(|metric| MetricDifference::new(&common, metric));
+        let (num_only_a, num_only_b) = (num_other(a), num_other(b));
         Self {
-            a: key_a,
-            b: key_b,
+            a: key,
+            b: key,
             num_scenes: common.len(),
             num_views,
-            num_only_a: num_other(a),
-            num_only_b: num_other(b),
-            psnr: MetricDifference::new(&common, PSNR),
-            ssim: MetricDifference::new(&common, SSIM),
-            lpips_vgg: MetricDifference::new(&common, LPIPS),
-            sharpness: MetricDifference::new(&common, SHARPNESS),
+            num_only_a,
+            num_only_b,
+            psnr,
+            ssim,
+            lpips_vgg,
+            sharpness,
         }
+    }
+}
+
+impl fmt::Display for Comparison {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "A: {}\nB: {}\n", self.a.display(), self.b.display())?;
+        let metrics = ["dB", "SSIM", "LPIPS", "sharpness"].map(|metric| format!("B - A, {metric} (95 %)"));
+        let header = ["method", "scenes", "PSNR of A", &metrics[0], &metrics[1], &metrics[2], &metrics[3]];
+        writeln!(f, "{}", table(header, self.pairs.iter().map(cells)))?;
+        writeln!(
+            f,
+            "\nMeans of paired differences over scenes, with 95 % intervals of Student's t; *: the interval excludes zero. Lower \
+             LPIPS is better."
+        )?;
+        let largest = |count: fn(&PairedRow) -> usize| self.pairs.iter().map(count).max().unwrap_or_default();
+        let (only_a, only_b) = (largest(|pair| pair.num_only_a), largest(|pair| pair.num_only_b));
+        if only_a + only_b > 0 {
+            let common = self.pairs.iter().map(|pair| pair.num_views).max().unwrap_or_default();
+            writeln!(
+                f,
+                "The evaluations have different target views: {common} common views are compared, up to {only_a} views of A \
+                 and {only_b} views of B are ignored."
+            )?;
+        }
+        for (side, keys) in [("A", &self.only_a), ("B", &self.only_b)] {
+            if !keys.is_empty() {
+                let keys = keys.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+                writeln!(f, "Only in {side}, not compared: {keys}.")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn cells(pair: &PairedRow) -> [String; 7] {
+    [
+        pair.a.to_string(),
+        pair.num_scenes.to_string(),
+        pair.psnr.map_or_else(|| "-".into(), |difference| format!("{:.2}", difference.a)),
+        interval(pair.psnr, 3),
+        interval(pair.ssim, 4),
+        interval(pair.lpips_vgg, 4),
+        interval(pair.sharpness, 3),
+    ]
+}
+
+fn interval(difference: Option<MetricDifference>, decimals: usize) -> String {
+    let Some(difference) = difference else { return "-".into() };
+    let mark = if difference.is_clear() { " *" } else { "" };
+    match difference.interval {
+        Some([low, high]) => {
+            format!("{:+.decimals$} [{low:+.decimals$}, {high:+.decimals$}]{mark}", difference.mean)
+        }
+        None => format!("{:+.decimals$}", difference.mean),
     }
 }
 

@@ -9,9 +9,8 @@ use serde::{Deserialize, Serialize};
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::view_metrics::{EvalKey, LPIPS, PSNR, SHARPNESS, SSIM, ViewMetrics, view_mean};
+use crate::statistics::view_metrics::{EvalKey, METRICS, ViewMetrics, view_mean};
 
-/// A row of `views.csv`.
 #[derive(Serialize, Deserialize)]
 struct ViewRow {
     scene: String,
@@ -30,7 +29,6 @@ struct ViewRow {
     context_frames: Option<String>,
 }
 
-/// A row of `scenes.csv`.
 #[derive(Serialize)]
 struct SceneRow<'a> {
     scene: &'a str,
@@ -74,10 +72,6 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
     write(path, rows).map_err(EvalError::io("writing the metrics of the views", path))
 }
 
-/// Reads `views.csv`.
-///
-/// # Errors
-/// [`EvalError::NotComparable`] for a file of another format, and for a view with two rows under one key.
 pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
     let bad = |error: csv::Error| EvalError::NotComparable { reason: error.to_string(), path: path.into() };
     let mut results = EvalResults::default();
@@ -99,18 +93,22 @@ pub fn read_views(path: &Path) -> Result<EvalResults, EvalError> {
 /// frames.
 pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
-        scenes.iter().map(move |(scene, views)| SceneRow {
-            scene,
-            method: key.method,
-            num_storage_tokens: key.num_storage_tokens,
-            num_render_tokens: key.num_render_tokens,
-            tokens: key.tokens,
-            num_views: views.len(),
-            psnr: view_mean(views, PSNR),
-            ssim: view_mean(views, SSIM),
-            lpips_vgg: view_mean(views, LPIPS),
-            sharpness: view_mean(views, SHARPNESS),
-            context_frames: results.context_list(scene),
+        let EvalKey { method, num_storage_tokens, num_render_tokens, tokens } = key;
+        scenes.iter().map(move |(scene, views)| {
+            let [psnr, ssim, lpips_vgg, sharpness] = METRICS.map(|metric| view_mean(views, metric));
+            SceneRow {
+                scene,
+                method,
+                num_storage_tokens,
+                num_render_tokens,
+                tokens,
+                num_views: views.len(),
+                psnr,
+                ssim,
+                lpips_vgg,
+                sharpness,
+                context_frames: results.context_list(scene),
+            }
         })
     });
     write(path, rows).map_err(EvalError::io("writing the means of the scenes", path))
@@ -157,7 +155,7 @@ attic,nearest_view,0,0,,1,18.5,,,,0 5 12
         let path = folder.path().join("a.csv");
         for order in [[0, 1, 2, 3], [3, 2, 1, 0]] {
             let mut results = EvalResults::default();
-            results.context_frames.insert("attic".into(), vec![0, 5, 12]);
+            results.facts.context_frames.insert("attic".into(), vec![0, 5, 12]);
             for (scene, frame, key, view) in order.map(|i| rows[i]) {
                 results.add(scene, frame, key, view);
             }

@@ -5,9 +5,9 @@
 
 use clift_core::{mean, standard_error};
 use serde::Serialize;
+use special::Beta;
 
 use crate::statistics::eval_results::SceneViews;
-use crate::statistics::student_t::t_quantile_95;
 use crate::statistics::view_metrics::{Metric, ViewMetrics};
 
 /// Returns the views that both have, by scene: the view of `a`, then that of `b`. Scenes without a common view are left out.
@@ -19,7 +19,6 @@ pub(crate) fn common_views(a: &SceneViews, b: &SceneViews) -> Vec<Vec<[ViewMetri
     common.filter(|views| !views.is_empty()).collect()
 }
 
-/// The paired difference of one metric.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MetricDifference {
     /// Mean over scenes of the first side.
@@ -53,10 +52,17 @@ impl MetricDifference {
         Some(Self { a, b, mean, stderr, interval })
     }
 
-    /// Returns whether the confidence interval excludes zero.
     pub fn is_clear(&self) -> bool {
         self.interval.is_some_and(|[low, high]| low > 0.0 || high < 0.0)
     }
+}
+
+/// Returns the half-width of the central 95 % of Student's t distribution: 12.7 for one degree of freedom, 1.96 for many.
+fn t_quantile_95(degrees: usize) -> f64 {
+    // P(|T| > t) is the regularized incomplete beta function of n / (n + t^2) (Abramowitz and Stegun 26.7.1).
+    let n = degrees as f64;
+    let x = 0.05_f64.inv_inc_beta(n / 2.0, 0.5, (n / 2.0).ln_beta(0.5));
+    (n * (1.0 - x) / x).sqrt()
 }
 
 fn column_means(rows: &[[f64; 3]]) -> Option<[f64; 3]> {
@@ -79,5 +85,15 @@ mod tests {
         assert!(of(0.5).is_clear() && of(-0.5).is_clear() && !of(-0.005).is_clear());
         let single = MetricDifference::new(&[vec![[view(1.0), view(2.0)]]], PSNR).unwrap();
         assert_eq!((single.mean, single.interval, single.is_clear()), (1.0, None, false));
+    }
+
+    #[test]
+    fn quantiles_equal_scipy() {
+        // scipy.stats.t.ppf(0.975, n)
+        for (degrees, expected) in [(1, 12.706_204_736), (2, 4.302_652_73), (30, 2.042_272_456), (6473, 1.960_330_539)]
+        {
+            let quantile = t_quantile_95(degrees);
+            assert!((quantile - expected).abs() < 1e-6, "{degrees}: {quantile} is not {expected}");
+        }
     }
 }

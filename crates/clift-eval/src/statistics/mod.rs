@@ -2,7 +2,6 @@
 //!
 //! - `view_metrics`: `EvalKey`, `ViewMetrics`, `Cost`
 //! - `eval_results`: metrics of every view
-//! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front
 //! - `metric_difference`: paired differences of views, with confidence intervals
 //! - `paired`: paired differences of methods
@@ -10,17 +9,14 @@
 //! - `csv_files`: views.csv and scenes.csv
 //! - `text_table`: aligned columns
 //! - `table`: the terminal table
-//! - `compare`: two evaluations, view by view
-//! - `compare_table`: its terminal table
+//! - `compare`: two evaluations, view by view, and their terminal table
 
 pub(crate) mod compare;
-pub(crate) mod compare_table;
 pub(crate) mod csv_files;
 pub(crate) mod eval_results;
 pub(crate) mod metric_difference;
 pub(crate) mod paired;
 pub(crate) mod pareto;
-pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;
 pub(crate) mod text_table;

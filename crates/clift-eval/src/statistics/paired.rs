@@ -17,18 +17,16 @@ const ORDERINGS: [[Method; 2]; 5] = [
     [Method::Clift, Method::TileClift],
 ];
 
-/// Mean PSNR difference of two methods on the same scenes, rendered from all stored tokens.
+/// Mean PSNR difference of two methods on the same scenes, rendered from all stored tokens; `method` is the one that the paper
+/// finds better.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PairedDifference {
-    /// The method that the paper finds better.
     pub method: Method,
-    /// The other method.
     pub against: Method,
     /// Tokens in the scene file, for both methods.
     pub num_storage_tokens: usize,
     /// Number format of the stored tokens of `method`; random subsets are always f32.
     pub tokens: Option<TokenCoding>,
-    /// Scenes measured with both methods.
     pub num_scenes: usize,
     /// Mean over scenes of `method` minus `against`, in dB; positive in agreement with the paper.
     pub psnr: f64,

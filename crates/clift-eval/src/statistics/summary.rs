@@ -13,137 +13,82 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::config::split::EvalSplit;
-use crate::config::token_selection::Selection;
 use crate::error::EvalError;
-use crate::statistics::eval_results::{ContextCheck, EvalResults, NotMeasured, SceneViews};
+use crate::statistics::eval_results::{ContextCheck, EvalResults, Facts, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
 use crate::statistics::view_metrics::{
-    Cost, EvalKey, LPIPS, Metric, PSNR, PSNR_CAP_DB, SHARPNESS, SSIM, ViewMetrics, best_method, view_mean,
+    Cost, EvalKey, METRICS, Metric, PSNR, PSNR_CAP_DB, ViewMetrics, best_method, view_mean,
 };
 
 /// Means over the views of a scene, then over scenes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
-    /// Mean over scenes of the scene's mean PSNR, in dB.
     pub psnr: Option<f64>,
-    /// Mean over scenes of the scene's mean SSIM.
     pub ssim: Option<f64>,
-    /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
-    /// Mean over scenes of the scene's mean sharpness.
     pub sharpness: Option<f64>,
-    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
+    /// Views whose PSNR is infinite, counted as [`PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
 }
 
 /// Quality of the baselines, which every method must exceed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Baselines {
-    /// Copying the nearest context view.
     pub nearest_view: Quality,
-    /// Averaging the context views.
     pub mean_image: Quality,
-}
-
-impl Baselines {
-    /// Returns both with their methods.
-    pub(crate) const fn list(self) -> [(Method, Quality); 2] {
-        [(Method::NearestView, self.nearest_view), (Method::MeanImage, self.mean_image)]
-    }
 }
 
 /// Means of one key; `null` where nothing was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SummaryPoint {
-    /// Method, token counts and number format.
     #[serde(flatten)]
     pub key: EvalKey,
-    /// Measured views; below the views of the evaluation only for an external method with missing images.
     pub num_views: usize,
-    /// Means over the views of a scene, then over scenes.
     #[serde(flatten)]
     pub quality: Quality,
     /// Standard error of `psnr` over scenes; `null` for a single scene.
     pub psnr_stderr: Option<f64>,
-    /// Mean PSNR over all views, in dB. Equals `psnr` if all scenes have the same number of views.
     pub psnr_per_view: Option<f64>,
-    /// Mean SSIM over all views.
     pub ssim_per_view: Option<f64>,
-    /// Mean LPIPS over all views.
     pub lpips_vgg_per_view: Option<f64>,
-    /// Mean sharpness over all views.
     pub sharpness_per_view: Option<f64>,
-    /// Mean rendering time per view, in seconds.
     pub render_s: Option<f64>,
-    /// Median rendering time per view, in seconds.
     pub render_median_s: Option<f64>,
-    /// 95th percentile of the rendering time (nearest rank), in seconds.
+    /// 95th percentile, nearest rank.
     pub render_p95_s: Option<f64>,
-    /// Mean time of a token selection, in seconds.
     pub select_s: Option<f64>,
-    /// Median time per frame (selection and rendering), in seconds.
+    /// Time per frame: selection and rendering.
     pub frame_median_s: Option<f64>,
-    /// 95th percentile of the time per frame, in seconds.
     pub frame_p95_s: Option<f64>,
-    /// Quartiles of the time per frame, in seconds: half of the frames take between the two.
+    /// Half of the frames take between the two.
     pub frame_quartiles_s: Option<[f64; 2]>,
-    /// Multiply-accumulates, bytes and memory.
     #[serde(flatten)]
     pub cost: Cost,
-    /// Whether no other point has a higher PSNR in a time per frame that is not clearly longer: whose quartiles
-    /// (`frame_quartiles_s`) do not lie above those of this point.
+    /// Whether no other point has a higher PSNR in a time per frame that is not clearly longer: whose quartiles do not lie
+    /// above those of this point.
     pub pareto_time: bool,
     /// Whether no other point is as good in PSNR for as few bytes (`scene_bytes`).
     pub pareto_bytes: bool,
 }
 
-/// Target images that an external method does not have.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct MissingImages {
-    /// The external method.
-    pub method: Method,
-    /// Number of target views without image.
-    pub num_missing: usize,
-    /// Paths of the missing images in the folder of the method.
-    pub images: Vec<String>,
-}
-
 /// The content of `summary.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Scenes with at least one measured view.
-    pub num_scenes: usize,
+    pub(crate) num_scenes: usize,
     /// Different target views measured.
     pub num_views: usize,
-    /// Skipped scenes; `skipped.json` has the reasons.
-    pub num_skipped: usize,
-    /// Origin of the measured views.
-    pub split: Option<EvalSplit>,
+    pub(crate) num_skipped: usize,
     /// Target views that are also contexts: the input holds their images.
-    pub num_context_targets: usize,
-    /// Context frames by scene.
-    pub context_frames: BTreeMap<String, Vec<usize>>,
-    /// The context views, rendered from all tokens; `null` on the data of a run's own training.
-    pub context_check: Option<ContextCheck>,
-    /// Scenes that the models were trained on.
-    pub training_scenes: BTreeSet<String>,
+    pub(crate) num_context_targets: usize,
     /// Share of the target pixels that masks leave out of the metrics; `null` without masks.
-    pub masked_share: Option<f64>,
-    /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
-    pub selection: Option<Selection>,
-    /// SHA-256 of the LPIPS weights.
-    pub lpips_weights_sha256: Option<String>,
-    /// Metrics that are `null` everywhere, with reasons.
-    pub not_measured: Vec<NotMeasured>,
-    /// External methods with missing images.
-    pub missing: Vec<MissingImages>,
-    /// Baselines.
-    pub baselines: Baselines,
+    pub(crate) masked_share: Option<f64>,
+    #[serde(flatten)]
+    pub(crate) facts: Facts,
+    pub(crate) baselines: Baselines,
     /// One point per key, ordered by method and ascending token counts.
     pub points: Vec<SummaryPoint>,
-    /// Paired differences of methods in the order of the paper.
-    pub differences: Vec<PairedDifference>,
+    pub(crate) differences: Vec<PairedDifference>,
 }
 
 impl Summary {
@@ -156,11 +101,6 @@ impl Summary {
             .collect();
         let scenes: BTreeSet<&str> = views.iter().map(|(scene, _)| *scene).collect();
         let quality = |method| results.of(EvalKey::baseline(method)).map(Quality::new).unwrap_or_default();
-        let missing = results.missing.iter().map(|(&method, images)| MissingImages {
-            method,
-            num_missing: images.len(),
-            images: images.iter().cloned().collect(),
-        });
         let mut points: Vec<SummaryPoint> = results
             .views()
             .filter(|(key, _)| !matches!(key.method, Method::NearestView | Method::MeanImage))
@@ -172,33 +112,24 @@ impl Summary {
             num_scenes: scenes.len(),
             num_views: views.len(),
             num_skipped: results.skipped.len(),
-            split: results.split,
             num_context_targets: results.context_targets.len(),
-            context_frames: results.context_frames.clone(),
-            context_check: results.context_check,
-            training_scenes: results.training_scenes.clone(),
             masked_share: (!results.masked.is_empty()).then(|| masked / views.len().max(1) as f64),
-            selection: results.selection,
-            lpips_weights_sha256: results.lpips_sha256.clone(),
-            not_measured: results.not_measured.clone(),
-            missing: missing.collect(),
+            facts: results.facts.clone(),
             baselines: Baselines { nearest_view: quality(Method::NearestView), mean_image: quality(Method::MeanImage) },
             points,
             differences: differences(results),
         }
     }
 
-    /// Says how many target pixels are masked, if some are.
     pub(crate) fn masked_note(&self) -> Option<String> {
         self.masked_share
             .map(|share| format!("{:.1} % of the target pixels are masked and do not count", 100.0 * share))
     }
 
-    /// Returns warnings about figures that mislead.
     pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
-        let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);
-        let split = split.into_iter().chain(training_scenes_note(&self.training_scenes));
-        split.chain(context_targets_note(self.num_context_targets)).chain(self.context_check.and_then(fog_note))
+        let split = self.facts.split.and_then(EvalSplit::warning).map(str::to_owned);
+        let split = split.into_iter().chain(training_scenes_note(&self.facts.training_scenes));
+        split.chain(context_targets_note(self.num_context_targets)).chain(self.facts.context_check.and_then(fog_note))
     }
 
     /// Returns the points of the main method in its finest number format.
@@ -256,13 +187,10 @@ fn scene_means(views: &SceneViews, metric: Metric) -> Vec<f64> {
 
 impl Quality {
     fn new(views: &SceneViews) -> Self {
-        Self {
-            psnr: mean(&scene_means(views, PSNR)),
-            ssim: mean(&scene_means(views, SSIM)),
-            lpips_vgg: mean(&scene_means(views, LPIPS)),
-            sharpness: mean(&scene_means(views, SHARPNESS)),
-            num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
-        }
+        let [psnr, ssim, lpips_vgg, sharpness] = METRICS.map(|metric| mean(&scene_means(views, metric)));
+        let num_identical_views =
+            views.values().flat_map(BTreeMap::values).filter(|view| view.psnr == f64::INFINITY).count();
+        Self { psnr, ssim, lpips_vgg, sharpness, num_identical_views }
     }
 }
 
@@ -270,6 +198,7 @@ impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
         let per_view = |metric: Metric| mean(&views.iter().filter_map(|view| metric(view)).collect::<Vec<_>>());
+        let [psnr_per_view, ssim_per_view, lpips_vgg_per_view, sharpness_per_view] = METRICS.map(per_view);
         let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
         let (render_s, select_s, frame_s) = timed(results, key);
         Self {
@@ -277,10 +206,10 @@ impl SummaryPoint {
             num_views: views.len(),
             quality: Quality::new(scenes),
             psnr_stderr: standard_error(&scene_means(scenes, PSNR)),
-            psnr_per_view: per_view(PSNR),
-            ssim_per_view: per_view(SSIM),
-            lpips_vgg_per_view: per_view(LPIPS),
-            sharpness_per_view: per_view(SHARPNESS),
+            psnr_per_view,
+            ssim_per_view,
+            lpips_vgg_per_view,
+            sharpness_per_view,
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
             render_p95_s: statistic(&render_s, p95),
@@ -288,7 +217,7 @@ impl SummaryPoint {
             frame_median_s: statistic(&frame_s, median),
             frame_p95_s: statistic(&frame_s, p95),
             frame_quartiles_s: quartiles(&frame_s),
-            cost: results.costs.get(&key).copied().unwrap_or_default(),
+            cost: results.cost(key),
             pareto_time: false,
             pareto_bytes: false,
         }
@@ -367,11 +296,11 @@ mod tests {
         views.add("a", 0, CLIFT, measured);
         let copy = ViewMetrics::quality(f64::INFINITY, Some(1.0));
         views.add("a", 0, EvalKey::baseline(Method::NearestView), copy);
-        views.split = Some(EvalSplit::HeldOutFrames);
+        views.facts.split = Some(EvalSplit::HeldOutFrames);
         views.context_targets.insert(("a".into(), 0));
-        views.context_frames.insert("a".into(), vec![0, 4]);
+        views.facts.context_frames.insert("a".into(), vec![0, 4]);
         views.add_context_check(ContextCheck { num_views: 2, num_fog: 1 });
-        views.training_scenes.insert("a".into());
+        views.facts.training_scenes.insert("a".into());
         views.masked.insert("a".into(), [(0, 0.25)].into());
         let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
@@ -398,7 +327,6 @@ mod tests {
             "masked_share": 0.25,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
-            "missing": [],
             "baselines": {
                 "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "sharpness": null, "num_identical_views": 1},
                 "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "sharpness": null, "num_identical_views": 0}
@@ -408,36 +336,8 @@ mod tests {
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), summary);
-    }
-
-    #[test]
-    fn fog_is_counted_in_a_warning() {
-        for (num_fog, expected) in
-            [(3, Some("3 of 8 context views, rendered from all tokens, are below 23 dB")), (0, None)]
-        {
-            let mut views = results(&[("a", 0, 20.0)]);
-            views.add_context_check(ContextCheck { num_views: 8, num_fog });
-            let warning = Summary::new(&views).warnings().next();
-            assert_eq!(warning.is_some(), expected.is_some(), "{warning:?}");
-            assert!(warning.unwrap_or_default().starts_with(expected.unwrap_or_default()));
-        }
-    }
-
-    #[test]
-    fn times_have_medians_and_95th_percentiles() {
-        let mut views = EvalResults::default();
-        for frame in 0..20 {
-            let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
-            let measured =
-                ViewMetrics { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..ViewMetrics::quality(20.0, None) };
-            views.add("a", frame, CLIFT, measured);
-        }
-        let point = Summary::new(&views).points.remove(0);
-        let near = |got: Option<f64>, expected: f64| (got.unwrap() - expected).abs() < 1e-12;
-        // 1 to 20 without 8, and 100: the middle two are 11 and 12, the 19th of 20 is 20.
-        assert!(near(point.render_median_s, 0.0115) && near(point.render_p95_s, 0.020), "{point:?}");
-        assert!(near(point.frame_median_s, 0.5115) && near(point.frame_p95_s, 0.520), "{point:?}");
-        assert!(near(point.select_s, 0.5), "{point:?}");
+        let warnings = summary.warnings().collect::<Vec<_>>().join("\n");
+        assert!(warnings.contains("1 of 2 context views, rendered from all tokens, are below 23 dB"), "{warnings}");
     }
 
     #[test]
@@ -457,6 +357,12 @@ mod tests {
             }
             views.add("a", frame, lvsm, timed(40.0, 18.0));
         }
+        let timed = |frame: usize| {
+            let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
+            ViewMetrics { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..ViewMetrics::quality(20.0, None) }
+        };
+        let selected = EvalKey { num_storage_tokens: 50, num_render_tokens: 7, ..f16 };
+        (0..20).for_each(|frame| assert!(views.add("a", frame, selected, timed(frame))));
         let points = Summary::new(&views).points;
         let of = |key| points.iter().find(|point| point.key == key).unwrap();
         assert_eq!(of(f16).frame_median_s, of(random).frame_median_s);
@@ -464,5 +370,11 @@ mod tests {
         assert_eq!(of(all).frame_quartiles_s, Some([0.002; 2]), "another computation: no selection");
         assert_eq!(of(lvsm).frame_quartiles_s, Some([0.04; 2]), "another network of as many tokens");
         assert_eq!([f16, int8, random, all].map(|key| of(key).pareto_time), [true, false, false, true]);
+        // 1 to 20 without 8, and 100: the middle two are 11 and 12, the 19th of 20 is 20.
+        let point = of(selected);
+        let near = |got: Option<f64>, expected: f64| (got.unwrap() - expected).abs() < 1e-12;
+        assert!(near(point.render_median_s, 0.0115) && near(point.render_p95_s, 0.020), "{point:?}");
+        assert!(near(point.frame_median_s, 0.5115) && near(point.frame_p95_s, 0.520), "{point:?}");
+        assert!(near(point.select_s, 0.5), "{point:?}");
     }
 }

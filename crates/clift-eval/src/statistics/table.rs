@@ -1,18 +1,15 @@
-//! The terminal table of a summary: quality, tokens and cost of every key; `-` was not measured.
+//! The table of a summary, in the terminal and in the report: quality, tokens and cost of every key; `-` was not measured.
 
 use std::fmt;
 
 use clift_data::plural;
+use clift_scene::CodedLoss;
 
 use crate::config::method::Method;
-use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Quality, Summary, SummaryPoint};
 use crate::statistics::text_table::table;
 
-/// Largest number of missing images in the table; `summary.json` has all.
-const MAX_NAMED: usize = 3;
-
-const HEADER: [&str; 16] = [
+pub const HEADER: [&str; 16] = [
     "method",
     "stored",
     "rendered",
@@ -26,17 +23,61 @@ const HEADER: [&str; 16] = [
     "frame ms",
     "half ms",
     "GMAC",
-    "values",
     "scene kB",
+    "coded kB",
     "",
 ];
 
+impl Summary {
+    /// Returns the rows below [`HEADER`], baselines first.
+    pub(crate) fn rows(&self) -> Vec<[String; HEADER.len()]> {
+        let baselines =
+            [(Method::NearestView, self.baselines.nearest_view), (Method::MeanImage, self.baselines.mean_image)];
+        let baselines = baselines.map(|(method, quality)| baseline_cells(method, quality, self.num_views));
+        baselines.into_iter().chain(self.points.iter().map(point_cells)).collect()
+    }
+
+    /// Returns what explains the table and its gaps.
+    pub(crate) fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
+        if self.points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
+            notes.push(
+                "frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times"
+                    .into(),
+            );
+            notes.push(
+                "t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes"
+                    .into(),
+            );
+        }
+        if self.points.iter().any(|point| point.cost.coded_bytes.is_some()) {
+            notes.push(format!(
+                "scene kB: a scene file in the format of the row; coded kB: in the default format of `clift encode`, coded \
+                 tokens, which lost at most {} dB where the codec was fitted",
+                CodedLoss::default().db()
+            ));
+        }
+        notes.extend(self.facts.selection.map(|selection| format!("rendered tokens were selected by {selection}")));
+        let not_measured = self.facts.not_measured.iter();
+        notes.extend(not_measured.map(|missing| format!("{} is not measured: {}", missing.metric, missing.reason)));
+        notes
+    }
+
+    pub(crate) fn difference_lines(&self) -> impl Iterator<Item = String> {
+        self.differences.iter().map(|row| {
+            let format = row.tokens.map_or_else(String::new, |tokens| tokens.to_string());
+            let names = format!("{} - {}", row.method.name(), row.against.name());
+            let (count, psnr, error) = (row.num_storage_tokens, row.psnr, cell(row.psnr_stderr, 2));
+            format!("{names:<24} {count:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")
+        })
+    }
+}
+
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
-        let split = self.split.map_or_else(String::new, |split| format!(" ({split})"));
-        let [views, scenes, skipped] = [(*num_views, "view"), (*num_scenes, "scene"), (*num_skipped, "scene")]
-            .map(|(count, noun)| plural(count, noun));
+        let split = self.facts.split.map_or_else(String::new, |split| format!(" ({split})"));
+        let counts = [(self.num_views, "view"), (self.num_scenes, "scene"), (self.num_skipped, "scene")];
+        let [views, scenes, skipped] = counts.map(|(count, noun)| plural(count, noun));
         writeln!(f, "{views} of {scenes}{split}, {skipped} skipped")?;
         if let Some(note) = self.masked_note() {
             writeln!(f, "{note}")?;
@@ -44,36 +85,14 @@ impl fmt::Display for Summary {
         for warning in self.warnings() {
             writeln!(f, "warning: {warning}")?;
         }
-        writeln!(f)?;
-        let baselines = baselines.list().map(|(method, quality)| baseline_cells(method, quality, *num_views));
-        writeln!(f, "{}", table(HEADER, baselines.into_iter().chain(points.iter().map(point_cells))))?;
-        if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
-            writeln!(
-                f,
-                "\nframe ms: median, half ms: the middle half of the frames; methods of equal token counts share their times\nt: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes"
-            )?;
+        writeln!(f, "\n{}\n", table(HEADER, self.rows()))?;
+        for note in self.notes() {
+            writeln!(f, "{note}")?;
         }
-        if let Some(selection) = self.selection {
-            writeln!(f, "\nrendered tokens were selected by {selection}")?;
-        }
-        if !differences.is_empty() {
+        if !self.differences.is_empty() {
             writeln!(f, "\nPSNR differences on the same scenes, with standard errors")?;
         }
-        for PairedDifference { method, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
-            let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or_else(String::new, |tokens| tokens.to_string()));
-            let names = format!("{} - {}", method.name(), against.name());
-            writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")?;
-        }
-        for missing in &self.missing {
-            let named = missing.images.iter().take(MAX_NAMED).cloned().collect::<Vec<_>>().join(", ");
-            let more = if missing.images.len() > MAX_NAMED { ", .." } else { "" };
-            let (name, count) = (missing.method.name(), missing.num_missing);
-            writeln!(f, "{name}: {count} of {num_views} images are missing; means are over the others: {named}{more}")?;
-        }
-        for missing in &self.not_measured {
-            writeln!(f, "{} is not measured: {}", missing.metric, missing.reason)?;
-        }
-        Ok(())
+        self.difference_lines().try_for_each(|line| writeln!(f, "{line}"))
     }
 }
 
@@ -91,6 +110,7 @@ fn baseline_cells(method: Method, quality: Quality, num_views: usize) -> [String
 fn point_cells(point: &SummaryPoint) -> [String; HEADER.len()] {
     let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
     let ms = |seconds: Option<f64>| cell(seconds.map(|seconds| seconds * 1e3), 1);
+    let kb = |bytes: Option<u64>| cell(bytes.map(|bytes| bytes as f64 / 1e3), 1);
     let quartiles = point.frame_quartiles_s.map(|[low, high]| format!("{:.1}..{:.1}", low * 1e3, high * 1e3));
     [
         point.key.method.name().into(),
@@ -105,9 +125,9 @@ fn point_cells(point: &SummaryPoint) -> [String; HEADER.len()] {
         ms(point.render_median_s),
         ms(point.frame_median_s),
         quartiles.unwrap_or_else(|| cell(None, 0)),
-        cell(point.cost.gflops, point.cost.gflops_decimals()),
-        point.cost.scene_values.map_or_else(|| cell(None, 0), |values| values.to_string()),
-        cell(point.cost.scene_kb(), 1),
+        cell(point.cost.gflops, if point.cost.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
+        kb(point.cost.scene_bytes),
+        kb(point.cost.coded_bytes),
         [if point.pareto_time { "t" } else { "" }, if point.pareto_bytes { "b" } else { "" }].concat(),
     ]
 }
@@ -120,7 +140,7 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 mod tests {
     use clift_scene::TokenCoding;
 
-    use crate::config::method::{Method, MethodName};
+    use crate::config::method::Method;
     use crate::statistics::eval_results::EvalResults;
     use crate::statistics::summary::Summary;
     use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics};
@@ -139,27 +159,22 @@ mod tests {
             };
             views.add(scene, 0, key, measured);
         }
-        let name = MethodName::new("DepthSplat").unwrap();
-        let other = EvalKey::baseline(Method::External(name));
-        views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) });
-        views.record_missing_image(other.method, "b/000000.png".into());
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5)));
-        let cost =
-            Cost { gflops: Some(45.23), scene_values: Some(49_152), scene_bytes: Some(99_000), ..Cost::default() };
+        let cost = Cost { gflops: Some(45.23), scene_bytes: Some(99_000), coded_bytes: Some(9_950), ..Cost::default() };
         views.costs.insert(key, cost);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
 
-method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  sharp  render ms  frame ms  half ms     GMAC  values  scene kB
-nearest_view  -       -         -       18.00    -      0.500  -      -      -          -         -           -     -       -
-mean_image    -       -         -       -        -      -      -      -      -          -         -           -     -       -
-clift         64      32        int8    20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  49152   99.0      tb
-DepthSplat    -       -         -       19.00    -      -      0.250  -      -          -         -           -     -       -
+method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  sharp  render ms  frame ms  half ms     GMAC  scene kB  coded kB
+nearest_view  -       -         -       18.00    -      0.500  -      -      -          -         -           -     -         -
+mean_image    -       -         -       -        -      -      -      -      -          -         -           -     -         -
+clift         64      32        int8    20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  99.0      9.9       tb
 
 frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
 t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes
-DepthSplat: 1 of 2 images are missing; means are over the others: b/000000.png
+scene kB: a scene file in the format of the row; coded kB: in the default format of `clift encode`, coded tokens, \
+which lost at most 0.02 dB where the codec was fitted
 lpips_vgg is not measured: no weights
 ";
         assert_eq!(Summary::new(&views).to_string(), expected);

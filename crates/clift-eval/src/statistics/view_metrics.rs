@@ -13,23 +13,19 @@ use crate::config::method::Method;
 /// method, then by ascending token counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct EvalKey {
-    /// The method.
     pub method: Method,
     /// Tokens in the scene file; 0 for a baseline.
     pub num_storage_tokens: usize,
     /// Tokens of a rendering; 0 for a baseline.
     pub num_render_tokens: usize,
-    /// Storage of the tokens; `None` without tokens.
     pub tokens: Option<TokenCoding>,
 }
 
 impl EvalKey {
-    /// Returns the key of a baseline or of an external method, which have no tokens.
     pub const fn baseline(method: Method) -> Self {
         Self { method, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
     }
 
-    /// Returns whether views are rendered from all stored tokens.
     pub const fn is_whole(self) -> bool {
         self.num_render_tokens == self.num_storage_tokens
     }
@@ -77,22 +73,15 @@ pub struct ViewMetrics {
     pub sharpness: Option<f64>,
     /// Rendering time of this view, from tokens to pixels, in seconds.
     pub render_s: Option<f64>,
-    /// Time of the token selection, in seconds.
     pub select_s: Option<f64>,
 }
 
 impl ViewMetrics {
-    /// Returns whether the rendering equals the target.
-    pub fn is_identical(&self) -> bool {
-        self.psnr == f64::INFINITY
-    }
-
     /// Returns the time per frame: token selection, if any, and rendering.
     pub fn frame_s(&self) -> Option<f64> {
         self.render_s.map(|render_s| render_s + self.select_s.unwrap_or_default())
     }
 
-    /// Returns metrics with PSNR and SSIM only.
     pub const fn quality(psnr: f64, ssim: Option<f64>) -> Self {
         Self { psnr, ssim, lpips_vgg: None, sharpness: None, render_s: None, select_s: None }
     }
@@ -103,40 +92,24 @@ pub(crate) type Metric = fn(&ViewMetrics) -> Option<f64>;
 
 /// PSNR as it counts in a mean, at most [`PSNR_CAP_DB`].
 pub(crate) const PSNR: Metric = |view| Some(view.psnr.min(PSNR_CAP_DB));
-pub(crate) const SSIM: Metric = |view| view.ssim;
-pub(crate) const LPIPS: Metric = |view| view.lpips_vgg;
-pub(crate) const SHARPNESS: Metric = |view| view.sharpness;
+pub(crate) const METRICS: [Metric; 4] = [PSNR, |view| view.ssim, |view| view.lpips_vgg, |view| view.sharpness];
 
 /// Returns the mean over the views of a scene that have the metric, by target frame; `None` without one.
 pub(crate) fn view_mean(views: &BTreeMap<usize, ViewMetrics>, metric: Metric) -> Option<f64> {
     mean(&views.values().filter_map(metric).collect::<Vec<_>>())
 }
 
-/// Cost of a key, the same for every view; `None` was not computed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
     /// Values of the stored tokens: tokens times their width.
     pub scene_values: Option<u64>,
-    /// Mean bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
     /// Mean bytes of a scene file as `clift encode` writes it by default: of condensed tokens with a codec.
     pub coded_bytes: Option<u64>,
     /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
     pub peak_bytes: Option<u64>,
-}
-
-impl Cost {
-    /// Returns the size of a scene file in kB.
-    pub fn scene_kb(&self) -> Option<f64> {
-        self.scene_bytes.map(|bytes| bytes as f64 / 1e3)
-    }
-
-    /// Returns the number of decimals of `gflops` in tables.
-    pub fn gflops_decimals(&self) -> usize {
-        if self.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }
-    }
 }
 
 #[cfg(test)]

@@ -1,9 +1,12 @@
 //! The stored tokens of a scene, by method, and the model that renders them.
 // N encoder tokens, S stored tokens, R rendered tokens, D width
 
-use clift_core::{Pose, PoseNormalization, item_rng};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+
+use clift_core::{Pose, PoseNormalization, derive_seed, item_rng};
 use clift_data::Clip;
-use clift_model::{Tokens, TrainedModel};
+use clift_model::{Clusters, Grouping, Tokens, TrainedModel};
 use clift_scene::{ContextGroup, Scene, TokenCodec, TokenCoding, TokenFormat, scene_file_bytes};
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -11,7 +14,39 @@ use rand::seq::SliceRandom;
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
-use crate::sweep::lazy_clusters::LazyClusters;
+use crate::sweep::sweep::Sweep;
+
+/// The encoder's tokens of a scene, and their groups, each computed for the first method that needs them.
+pub(crate) struct Lift<'a> {
+    /// `[1, N, D]`
+    pub tokens: Tokens,
+    pub seed: u64,
+    sweep: &'a Sweep,
+    /// Number of context views, and rows and columns of patches of a view.
+    views: (usize, [usize; 2]),
+    /// Groups by grouping and number.
+    groups: RefCell<BTreeMap<(usize, usize), Clusters>>,
+}
+
+impl<'a> Lift<'a> {
+    pub fn new(tokens: Tokens, sweep: &'a Sweep, clip: &Clip) -> Self {
+        let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
+        let (seed, views) = (derive_seed(sweep.seed, &clip.key), (clip.context.num_views(), grid));
+        Self { tokens, seed, sweep, views, groups: RefCell::default() }
+    }
+
+    fn groups(&self, grouping: Grouping, count: usize) -> Result<Clusters, EvalError> {
+        let key = (grouping as usize, count);
+        if let Some(groups) = self.groups.borrow().get(&key) {
+            return Ok(groups.clone());
+        }
+        let tokens = || self.tokens.values.clone();
+        let groups = grouping.group(count, self.views, (&self.sweep.kmeans, self.seed), tokens)?;
+        let groups = Clusters::new(vec![groups])?;
+        self.groups.borrow_mut().insert(key, groups.clone());
+        Ok(groups)
+    }
+}
 
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
@@ -28,22 +63,21 @@ impl<'a> CompressedTokens<'a> {
     pub fn new(
         method: Method,
         models: &'a EvalModels,
-        (lift, clusters): (&Tokens, &LazyClusters),
+        (lift, count): (&Lift, usize),
         coding: TokenCoding,
         (clip, model_path): (&Clip, &str),
     ) -> Result<Self, EvalError> {
         let model = models.for_method(method).ok_or_else(|| EvalError::NoModel { method: method.name().into() })?;
         let Some(grouping) = method.grouping() else {
-            let ids =
-                random_subset(lift.dims()[1], clusters.num_clusters, item_rng(clusters.seed, 0, 0, 0, "random subset"));
-            return Ok(Self { tokens: lift.select(&ids), ids, model, file_bytes: None });
+            let ids = random_subset(lift.tokens.dims()[1], count, item_rng(lift.seed, 0, 0, 0, "random subset"));
+            return Ok(Self { tokens: lift.tokens.select(&ids), ids, model, file_bytes: None });
         };
-        let clusters = clusters.groups(grouping)?;
+        let clusters = lift.groups(grouping, count)?;
         let uploaded = clusters.upload(&model.device);
         let tokens = if method.is_condensed() {
-            model.network.compress(lift.clone(), &uploaded)
+            model.network.compress(lift.tokens.clone(), &uploaded)
         } else {
-            lift.centroids(&uploaded)
+            lift.tokens.centroids(&uploaded)
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();
         let (num_tokens, num_views) = (ids.len(), clip.context.num_views());
@@ -55,7 +89,7 @@ impl<'a> CompressedTokens<'a> {
             TokenCoding::Coded(loss) => {
                 let codec =
                     models.codec.as_ref().ok_or_else(|| EvalError::NoModel { method: "coded tokens".into() })?;
-                let share = num_tokens as f64 / lift.dims()[1] as f64;
+                let share = num_tokens as f64 / lift.tokens.dims()[1] as f64;
                 let step = codec.rates.step_for_loss(share, loss.db()) as f32;
                 let scene = scene_of(clip, codec, &ids, tokens.to_host()?, model_path);
                 let bytes = scene.coded_bytes(codec, step)?.len() as u64;
@@ -111,19 +145,5 @@ fn scene_of(clip: &Clip, codec: &TokenCodec, ids: &[u32], tokens: Vec<f32>, mode
         world: PoseNormalization { mean_c2w: Pose::IDENTITY, scale: 1.0 },
         token_ids: ids.into(),
         tokens,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn random_subsets_are_nested_and_seeded() {
-        let subset = |count, seed| random_subset(50, count, item_rng(seed, 0, 0, 0, "random subset"));
-        let (few, more) = (subset(5, 1), subset(20, 1));
-        assert!(few.iter().all(|token| more.contains(token)));
-        assert!(more.windows(2).all(|pair| pair[0] < pair[1]));
-        assert_ne!(few, subset(5, 2));
     }
 }

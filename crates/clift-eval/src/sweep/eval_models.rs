@@ -38,19 +38,15 @@ impl EvalModels {
         }
     }
 
-    /// Whether stage 1 is a network whose tokens can be clustered.
-    pub fn supports_clusters(&self) -> bool {
-        self.stage1.config.architecture.supports_clusters()
-    }
-
     /// Returns the model that renders a method, the first of several; `None` without one and for baselines.
     pub fn for_method(&self, method: Method) -> Option<&TrainedModel> {
+        let can_cluster = |model: &&TrainedModel| model.config.architecture.supports_clusters();
         match method {
-            Method::Random | Method::Tile | Method::Kmeans => Some(&self.stage1).filter(|_| self.supports_clusters()),
+            Method::Random | Method::Tile | Method::Kmeans => Some(&self.stage1).filter(can_cluster),
             Method::Whole(network) => self.whole.iter().find(|model| model.config.architecture == network),
             Method::Clift => self.stage2.as_ref(),
             Method::TileClift => self.stage2_tiles.as_ref(),
-            Method::NearestView | Method::MeanImage | Method::External(_) => None,
+            Method::NearestView | Method::MeanImage => None,
         }
     }
 

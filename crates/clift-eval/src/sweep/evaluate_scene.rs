@@ -4,19 +4,18 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::time::Instant;
 
-use clift_core::{derive_seed, median};
+use clift_core::median;
 use clift_data::Clip;
-use clift_model::{Cameras, FlopConvention, Grouping, ModelError, Tokens, TrainedModel, Views};
+use clift_model::{Cameras, FlopConvention, ModelError, Tokens, TrainedModel, Views};
 use clift_scene::{CodedLoss, TokenCoding};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{Cost, EvalKey};
-use crate::sweep::compressed_tokens::CompressedTokens;
+use crate::sweep::compressed_tokens::{CompressedTokens, Lift};
 use crate::sweep::context_check::check_contexts;
 use crate::sweep::eval_models::EvalModels;
-use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
 use crate::sweep::sweep::Sweep;
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
@@ -28,13 +27,9 @@ const MAX_REPETITION_S: f64 = 5.0;
 
 /// Renders and scores the target views of one scene, and adds their metrics to `metrics`.
 ///
-/// As in the paper, all target views of a scene share one random subset. Returns the images, clusters and selected
-/// tokens of the scene if `keep_images` is set and the scene has a target view.
-///
-/// # Errors
-/// [`BadTokenCount`](clift_model::ModelError::BadTokenCount) for a count above the tokens of the scene,
-/// [`EvalError::BadImage`] for a rendering with a NaN or an infinity, and the errors of the model.
-pub fn evaluate_scene(
+/// As in the paper, all target views of a scene share one random subset. Returns the images of the scene if `keep_images` is
+/// set and the scene has a target view.
+pub(crate) fn evaluate_scene(
     models: &EvalModels,
     clip: &Clip,
     sweep: &Sweep,
@@ -46,13 +41,13 @@ pub fn evaluate_scene(
     let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
     let scorer = ViewScorer::new(clip, sweep.lpips.as_ref());
     let renderer = TargetRenderer { clip, scorer: &scorer, cameras: Cameras::upload(&[&clip.target], device)?, sweep };
-    let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
-    for rendering in &results.renderings {
+    let mut renderings = baselines(clip, &scorer, &kept_views)?;
+    for rendering in &renderings {
         record(clip, rendering, metrics);
     }
     let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
     metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
-    metrics.context_frames.insert(clip.key.clone(), clip.context.frame_index.clone());
+    metrics.facts.context_frames.insert(clip.key.clone(), clip.context.frame_index.clone());
     if sweep.checks_contexts {
         metrics.add_context_check(check_contexts(models, &context, clip)?);
     }
@@ -62,8 +57,8 @@ pub fn evaluate_scene(
         }
     }
     let mut jobs = Vec::new();
-    if models.supports_clusters() {
-        add_jobs(models, &context, &renderer, &kept_views, &mut jobs, (&mut results, metrics))?;
+    if models.stage1.config.architecture.supports_clusters() {
+        add_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
     }
     add_whole_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
     let num_timed =
@@ -71,15 +66,10 @@ pub fn evaluate_scene(
     for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
         record(clip, &rendering, metrics);
         if !job.kept_views.is_empty() {
-            results.renderings.push(rendering);
+            renderings.push(rendering);
         }
     }
-    for external in &sweep.external_methods {
-        let scored = external.score(clip, &scorer, &kept_views, metrics)?;
-        record(clip, &scored, metrics);
-        results.renderings.push(scored);
-    }
-    Ok((!kept_views.is_empty()).then_some(results))
+    Ok((!kept_views.is_empty()).then_some(SceneResults { renderings, kept_views }))
 }
 
 /// Adds the renderings of `CLiFT`'s methods from every count of stored tokens.
@@ -89,73 +79,46 @@ fn add_jobs<'a>(
     renderer: &TargetRenderer,
     kept_views: &'a [usize],
     jobs: &mut Vec<RenderJob<'a>>,
-    (results, metrics): (&mut SceneResults, &mut EvalResults),
+    metrics: &mut EvalResults,
 ) -> Result<(), EvalError> {
     let TargetRenderer { clip, sweep, .. } = *renderer;
     let stage1 = &models.stage1.network;
     let features = stage1.features(context);
     // Stage 2 may have trained its own token norm; its tokens are then grouped and condensed after that norm.
-    let normed: Vec<(Method, Tokens)> = Method::own()
+    let own: Vec<(Method, Lift)> = Method::own()
         .filter(|method| method.is_condensed())
         .filter_map(|method| Some((method, models.for_method(method)?)))
         .filter(|(_, model)| model.config.has_token_norm())
-        .map(|(method, model)| (method, model.network.normalize(features.clone())))
+        .map(|(method, model)| (method, Lift::new(model.network.normalize(features.clone()), sweep, clip)))
         .collect();
-    let lift = stage1.normalize(features); // [1, N, D]
-    let [_, num_tokens, _] = lift.dims();
-    let seed = derive_seed(sweep.seed, &clip.key);
-    let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
-    let views = (clip.context.num_views(), grid);
+    let lift = Lift::new(stage1.normalize(features), sweep, clip);
     for &count in &sweep.eval.stored_tokens {
-        let num_storage_tokens = count.of(num_tokens)?;
-        let clusters = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
-        let own_norm: Vec<_> = normed
-            .iter()
-            .map(|(of, lift)| {
-                (*of, lift, LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed))
-            })
-            .collect();
+        let count = count.of(lift.tokens.dims()[1])?;
         for &method in sweep.eval.methods.iter().filter(|method| method.network().is_none()) {
-            let own = own_norm.iter().find(|(of, ..)| *of == method);
-            let (lift, clusters) = own.map_or((&lift, &clusters), |(_, lift, clusters)| (*lift, clusters));
+            let lift = own.iter().find(|(of, _)| *of == method).map_or(&lift, |(_, lift)| lift);
+            let compressed =
+                |coding, path: &str| CompressedTokens::new(method, models, (lift, count), coding, (clip, path));
             for (i, coding) in sweep.eval.formats_of(method).into_iter().enumerate() {
+                let stored = compressed(coding, sweep.model_path.as_str())?;
                 let kept_views = if i == 0 { kept_views } else { &[] };
-                let stored =
-                    CompressedTokens::new(method, models, (lift, clusters), coding, (clip, &sweep.model_path))?;
                 let whole =
-                    EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(coding) };
-                let first = jobs.len();
-                let all = RenderJob::new(whole, &stored, None, kept_views);
-                renderer.warm_up(&all, metrics)?;
-                jobs.push(all);
-                for num_render_tokens in sweep.eval.render_counts(num_storage_tokens) {
-                    let some = EvalKey { num_render_tokens, ..whole };
-                    let patch_size = sweep.model.patch_size;
-                    metrics.selection = Some(sweep.eval.selection);
+                    EvalKey { method, num_storage_tokens: count, num_render_tokens: count, tokens: Some(coding) };
+                renderer.add_job(RenderJob::new(whole, &stored, None, kept_views), &stored, jobs, metrics)?;
+                for num_render_tokens in sweep.eval.render_counts(count) {
+                    let (selection, patch_size) = (sweep.eval.selection, sweep.model.patch_size);
+                    metrics.facts.selection = Some(selection);
                     let selected =
-                        select_for_views(sweep.eval.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
-                    if !kept_views.is_empty() {
-                        results.selections.push((some, stored.ids.clone(), selected.clone()));
-                    }
+                        select_for_views(selection, clip, &stored.ids, patch_size, num_render_tokens, lift.seed)?;
+                    let some = EvalKey { num_render_tokens, ..whole };
                     let some = RenderJob::new(some, &stored, Some(selected), kept_views);
-                    renderer.warm_up(&some, metrics)?;
-                    jobs.push(some);
-                }
-                if let Some(bytes) = stored.file_bytes {
-                    jobs[first..].iter().for_each(|job| metrics.add_scene_bytes(job.key, bytes));
+                    renderer.add_job(some, &stored, jobs, metrics)?;
                 }
                 if method == Method::Clift && models.codec.is_some() {
-                    let default = TokenCoding::Coded(CodedLoss::default());
                     // Without the path of the model: equal runs have equal results in any folder.
-                    let coded = CompressedTokens::new(method, models, (lift, clusters), default, (clip, ""))?;
+                    let coded = compressed(TokenCoding::Coded(CodedLoss::default()), "")?;
                     metrics.add_coded_bytes(whole, coded.file_bytes.unwrap_or_default());
                 }
             }
-        }
-        if !kept_views.is_empty() {
-            let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
-            let clusters = own.map_or(&clusters, |(.., clusters)| clusters);
-            results.clusters.push(clusters.groups(Grouping::Kmeans)?.scenes()[0].clone());
         }
     }
     Ok(())
@@ -177,18 +140,13 @@ fn add_whole_jobs<'a>(
             continue;
         }
         let tokens = model.network.encode(context);
+        let count = tokens.dims()[1];
         for (i, coding) in sweep.eval.formats_of(method).into_iter().enumerate() {
             let TokenCoding::Plain(format) = coding else { continue };
             let stored = CompressedTokens::whole(model, tokens.clone(), format, clip.context.num_views())?;
-            let count = tokens.dims()[1];
-            let (num_storage_tokens, num_render_tokens) = (count, count);
-            let key = EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(coding) };
+            let key = EvalKey { method, num_storage_tokens: count, num_render_tokens: count, tokens: Some(coding) };
             let job = RenderJob::new(key, &stored, None, if i == 0 { kept_views } else { &[] });
-            renderer.warm_up(&job, metrics)?;
-            jobs.push(job);
-            if let Some(bytes) = stored.file_bytes {
-                metrics.add_scene_bytes(key, bytes);
-            }
+            renderer.add_job(job, &stored, jobs, metrics)?;
         }
     }
     Ok(())
@@ -201,7 +159,6 @@ fn record(clip: &Clip, rendering: &ScoredViews, metrics: &mut EvalResults) {
     }
 }
 
-/// Renderings of all target views under one key.
 struct RenderJob<'a> {
     key: EvalKey,
     /// Stored tokens, `[1, S, D]`.
@@ -223,7 +180,6 @@ impl<'a> RenderJob<'a> {
     }
 }
 
-/// Renders and times the target views of a scene.
 struct TargetRenderer<'a> {
     clip: &'a Clip,
     scorer: &'a ViewScorer<'a>,
@@ -242,19 +198,31 @@ impl TargetRenderer<'_> {
         Ok(image.into_data().convert::<f32>().try_to_vec().map_err(ModelError::device)?)
     }
 
-    /// Renders one untimed view of a key that has no cost yet: one-time work of the device, and the peak memory.
-    fn warm_up(&self, job: &RenderJob, metrics: &mut EvalResults) -> Result<(), EvalError> {
-        let Entry::Vacant(cost) = metrics.costs.entry(job.key) else { return Ok(()) };
-        // Queued work must not count as rendering.
-        job.tokens.values.device().sync().map_err(ModelError::device)?;
-        let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
-        self.render_view(job, 0)?;
-        let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
-        let target = &self.clip.target;
-        let macs = job.model.config.render_macs(target.height, target.width, job.key.num_render_tokens)?;
-        let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
-        let scene_values = Some((job.key.num_storage_tokens * job.model.config.dim) as u64);
-        cost.insert(Cost { gflops, scene_values, peak_bytes, ..Cost::default() });
+    /// Adds a job and the size of its scene file, and renders one untimed view of a key that has no cost yet: one-time work of
+    /// the device, and the peak memory.
+    fn add_job<'a>(
+        &self,
+        job: RenderJob<'a>,
+        stored: &CompressedTokens,
+        jobs: &mut Vec<RenderJob<'a>>,
+        metrics: &mut EvalResults,
+    ) -> Result<(), EvalError> {
+        if let Entry::Vacant(cost) = metrics.costs.entry(job.key) {
+            // Queued work must not count as rendering.
+            job.tokens.values.device().sync().map_err(ModelError::device)?;
+            let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
+            self.render_view(&job, 0)?;
+            let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
+            let target = &self.clip.target;
+            let macs = job.model.config.render_macs(target.height, target.width, job.key.num_render_tokens)?;
+            let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
+            let scene_values = Some((job.key.num_storage_tokens * job.model.config.dim) as u64);
+            cost.insert(Cost { gflops, scene_values, peak_bytes, ..Cost::default() });
+        }
+        if let Some(bytes) = stored.file_bytes {
+            metrics.add_scene_bytes(job.key, bytes);
+        }
+        jobs.push(job);
         Ok(())
     }
 

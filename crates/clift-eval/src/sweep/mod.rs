@@ -2,21 +2,17 @@
 //!
 //! - `eval_models`: trained models per method
 //! - `sweep`: settings of a sweep
-//! - `lazy_clusters`: K-means or tiles, computed once
-//! - `compressed_tokens`: stored tokens of a method
+//! - `compressed_tokens`: tokens of a scene, their groups, stored tokens of a method
 //! - `token_choice`: tokens selected for each view
 //! - `context_check`: the context views, rendered themselves
 //! - `view_scorer`: score renderings of a scene
 //! - `rendered_views`: scored views of one `EvalKey`, results of one scene
-//! - `predictions`: images of another method, scored
 //! - `evaluate_scene`: encode once, render every key
 
 pub(crate) mod compressed_tokens;
 pub(crate) mod context_check;
 pub(crate) mod eval_models;
 pub(crate) mod evaluate_scene;
-pub(crate) mod lazy_clusters;
-pub(crate) mod predictions;
 pub(crate) mod rendered_views;
 pub(crate) mod sweep;
 pub(crate) mod token_choice;

@@ -1,21 +1,19 @@
-//! The target views of a scene as one key renders them, and the results of the scene, from which its figures are made.
+//! The target views of a scene as one key renders them, and the results of the scene, from which its contact sheet is made.
 
 use std::collections::BTreeMap;
 
 use clift_data::Clip;
-use clift_model::SceneClusters;
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
-use crate::sweep::token_choice::SelectedTokens;
 use crate::sweep::view_scorer::ViewScorer;
 use clift_scene::{mean_image, nearest_image};
 
 /// The scored target views of a scene under one key.
 pub(crate) struct ScoredViews {
     pub key: EvalKey,
-    /// Metrics by target view. Only an external method can miss views.
+    /// Metrics by target view.
     pub metrics: BTreeMap<usize, ViewMetrics>,
     /// Kept images by target view, `[height, width, 3]` in `[0, 1]`.
     pub images: BTreeMap<usize, Vec<f32>>,
@@ -43,26 +41,13 @@ impl ScoredViews {
     }
 }
 
-/// Largest number of target views whose images are kept.
 pub(crate) const MAX_KEPT_VIEWS: usize = 6;
 
-/// Images, clusters and selected tokens of one scene.
-pub struct SceneResults {
-    /// The renderings of every key: baselines first, external methods last.
-    pub(crate) renderings: Vec<ScoredViews>,
-    /// The clusters of every storage count.
-    pub(crate) clusters: Vec<SceneClusters>,
-    /// The patches of the stored tokens, and the tokens selected for every target.
-    pub(crate) selections: Vec<(EvalKey, Vec<u32>, Vec<SelectedTokens>)>,
+pub(crate) struct SceneResults {
+    /// The renderings of every key: baselines first.
+    pub renderings: Vec<ScoredViews>,
     /// The target views whose images are kept; at least one.
-    pub(crate) kept_views: Vec<usize>,
-}
-
-impl SceneResults {
-    /// Starts with the baselines, of which the images of `kept_views` are kept.
-    pub(crate) fn new(baselines: Vec<ScoredViews>, kept_views: Vec<usize>) -> Self {
-        Self { renderings: baselines, clusters: Vec::new(), selections: Vec::new(), kept_views }
-    }
+    pub kept_views: Vec<usize>,
 }
 
 /// Returns all of `0..count`, or `most` of them from the first to the last; `most` is at least 2.
@@ -82,15 +67,4 @@ pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, kept_views: &[usize]) 
         means.add(view, mean.clone(), scorer, kept_views)?;
     }
     Ok(vec![nearest, means])
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn kept_views_span_first_to_last() {
-        assert_eq!(spread(6, MAX_KEPT_VIEWS), [0, 1, 2, 3, 4, 5]);
-        assert_eq!(spread(121, MAX_KEPT_VIEWS), [0, 24, 48, 72, 96, 120]);
-    }
 }

@@ -3,7 +3,6 @@
 use clift_model::{KMeans, Lpips, ModelConfig};
 
 use crate::config::eval_config::EvalConfig;
-use crate::sweep::predictions::ExternalMethod;
 
 /// Settings of a sweep.
 #[derive(Clone, Debug)]
@@ -20,8 +19,6 @@ pub struct Sweep {
     pub model: ModelConfig,
     /// LPIPS; `None` without its weights.
     pub lpips: Option<Lpips>,
-    /// Methods of other programs, given by their images.
-    pub external_methods: Vec<ExternalMethod>,
     /// Whether the device is a CPU, where the peak memory of the process includes the tensors.
     pub is_cpu: bool,
     /// Whether the context views are rendered too, to find those that come out as fog.

@@ -15,7 +15,6 @@ use crate::sweep::compressed_tokens::random_subset;
 pub(crate) struct SelectedTokens {
     /// Rows of the stored tokens, ascending.
     pub tokens: Vec<u32>,
-    /// Time of the selection, in seconds.
     pub select_s: f64,
 }
 
@@ -96,6 +95,8 @@ mod tests {
         let sampled = tokens(Selection::Random, &clip(&[0.0; 20], &(0..20).collect::<Vec<_>>()), 4);
         assert!(sampled.iter().all(|tokens| tokens.len() == 4 && tokens.windows(2).all(|pair| pair[0] < pair[1])));
         assert!(sampled.iter().any(|tokens| *tokens != sampled[0]));
-        assert_eq!(random_subset(8, 4, item_rng(5, 3, 0, 0, "random selection")), sampled[3]);
+        let subset = |count| random_subset(8, count, item_rng(5, 3, 0, 0, "random selection"));
+        assert_eq!(subset(4), sampled[3]);
+        assert!(subset(4).iter().all(|token| subset(6).contains(token)), "subsets are nested");
     }
 }

@@ -15,7 +15,6 @@ use crate::statistics::view_metrics::ViewMetrics;
 /// features of further targets are computed every time.
 const MAX_CACHED_BYTES: usize = 1 << 30;
 
-/// Compares renderings of a scene with its target views.
 pub(crate) struct ViewScorer<'a> {
     target: &'a ClipViews,
     /// As [`Clip::target_weights`].

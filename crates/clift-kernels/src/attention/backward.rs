@@ -4,36 +4,20 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::attention::shapes::{AttentionGradients, AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows};
+use crate::attention::shapes::{AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_panels, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
-use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
+use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
 use crate::simd::vector::{Operands, Simd};
 
 /// Keys per block: a task holds a block of scores and one of their gradients.
 const BACKWARD_KEYS: usize = 256;
 
-/// Inputs of [`attention_backward`]: inputs and results of [`attention_forward`](crate::attention_forward), and the
-/// gradient of the output.
-#[derive(Clone, Copy, Debug)]
-pub struct BackwardInputs<'a> {
-    /// Queries.
-    pub query: StridedRows<'a>,
-    /// Keys.
-    pub key: StridedRows<'a>,
-    /// Values.
-    pub value: StridedRows<'a>,
-    /// Output of the forward pass.
-    pub output: StridedRows<'a>,
-    /// Log sums of the forward pass, `[batch, num_heads, num_queries]`.
-    pub log_sum: &'a [f32],
-    /// Gradient of the output.
-    pub grad_output: StridedRows<'a>,
-}
-
-/// Computes the gradients of queries, keys and values.
+/// Computes the gradients of queries, keys and values: `[batch, num_queries, 3 dim]` side by side in one slice, or those of
+/// the queries in one and those of keys and values, `[batch, num_keys, 2 dim]`, in another. `inputs` are queries, keys, values,
+/// output and gradient of the output; `log_sum` is that of [`attention_forward`](crate::attention_forward).
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`,
 /// `dK = s dS^T Q`. The scores are computed again, a block at a time. Operands of the products have the type `operands`,
@@ -42,26 +26,28 @@ pub fn attention_backward(
     set: InstructionSet,
     operands: OperandType,
     sizes: AttentionSizes,
-    inputs: BackwardInputs<'_>,
-    gradients: AttentionGradients<'_>,
+    inputs: [StridedRows<'_>; 5],
+    log_sum: &[f32],
+    gradients: &mut [&mut [f32]],
 ) {
     let AttentionSizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
     let dim = sizes.dim();
-    assert_eq!(inputs.log_sum.len(), batch * num_heads * num_queries, "one log sum per row of scores");
+    assert_eq!(log_sum.len(), batch * num_heads * num_queries, "one log sum per row of scores");
     match gradients {
-        AttentionGradients::Packed(packed) => {
+        [packed] => {
             assert!(packed.len() == batch * num_queries * 3 * dim && num_keys == num_queries);
             let packed = SharedSlice::new(packed);
             let part = |part| HeadBlocks { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
-            backward_into(set, operands, sizes, inputs, [part(0), part(1), part(2)]);
+            backward_into(set, operands, sizes, (inputs, log_sum), [part(0), part(1), part(2)]);
         }
-        AttentionGradients::Separate { query, key_value } => {
+        [query, key_value] => {
             assert!(query.len() == batch * num_queries * dim && key_value.len() == batch * num_keys * 2 * dim);
             let (query, key_value) = (SharedSlice::new(query), SharedSlice::new(key_value));
             let part = |part| HeadBlocks { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
             let query = HeadBlocks { values: &query, count: num_queries, width: dim, first: 0 };
-            backward_into(set, operands, sizes, inputs, [query, part(0), part(1)]);
+            backward_into(set, operands, sizes, (inputs, log_sum), [query, part(0), part(1)]);
         }
+        _ => panic!("gradients are in one slice or in two"),
     }
 }
 
@@ -70,7 +56,7 @@ fn backward_into(
     set: InstructionSet,
     operands: OperandType,
     sizes: AttentionSizes,
-    inputs: BackwardInputs<'_>,
+    (inputs, log_sum): ([StridedRows<'_>; 5], &[f32]),
     [grad_query, grad_key, grad_value]: [HeadBlocks<'_>; 3],
 ) {
     let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
@@ -82,16 +68,20 @@ fn backward_into(
         .map(|task| {
             let (head, part) = (task / parts, task % parts);
             let bound = |part: usize| (part * blocks / parts * BACKWARD_KEYS).min(num_keys);
+            let mut grad_query = Vec::new();
             let task = BackwardTask {
                 sizes,
                 inputs,
+                log_sum,
+                grad_query: &mut grad_query,
                 grad_key,
                 grad_value,
                 scene: head / num_heads,
                 head: head % num_heads,
                 keys: bound(part)..bound(part + 1),
             };
-            set.run_product(operands, task)
+            set.run_product(operands, task);
+            grad_query
         })
         .collect();
     (0..sizes.batch * num_heads).into_par_iter().for_each(|head| {
@@ -108,7 +98,10 @@ fn backward_into(
 
 struct BackwardTask<'a> {
     sizes: AttentionSizes,
-    inputs: BackwardInputs<'a>,
+    inputs: [StridedRows<'a>; 5],
+    log_sum: &'a [f32],
+    /// Receives the unscaled gradients of all queries from the task's keys, in rows of the padded head width.
+    grad_query: &'a mut Vec<f32>,
     grad_key: HeadBlocks<'a>,
     grad_value: HeadBlocks<'a>,
     scene: usize,
@@ -116,13 +109,11 @@ struct BackwardTask<'a> {
     keys: Range<usize>,
 }
 
-impl<'a> ProductKernel for BackwardTask<'a> {
-    /// Unscaled gradients of all queries from the task's keys, in rows of the padded head width.
-    type Output = Vec<f32>;
-
+impl<'a> Kernel for BackwardTask<'a> {
     #[inline(always)]
-    fn run<S: Simd, O: Operands>(self, simd: S) -> Vec<f32> {
-        let Self { sizes, inputs, grad_key, grad_value, scene, head, keys } = self;
+    fn run<S: Simd, O: Operands>(self, simd: S) {
+        let Self { sizes, inputs, log_sum, grad_query, grad_key, grad_value, scene, head, keys } = self;
+        let [query, key, value, output, grad_output] = inputs;
         let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
         let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
         let block = num_keys.min(BACKWARD_KEYS);
@@ -145,7 +136,7 @@ impl<'a> ProductKernel for BackwardTask<'a> {
             QUERY_BLOCK * score_row,
             only_pairs(lanes_of::<O>(QUERY_BLOCK) * score_row),
         ];
-        let mut grad_query = vec![0.0; num_queries * width];
+        grad_query.resize(num_queries * width, 0.0);
         let rows_of =
             |rows: StridedRows<'a>, range: Range<usize>| range.map(move |row| rows.head(&sizes, scene, row, head));
         let mut scratch = Scratch::take(lens.iter().sum());
@@ -164,26 +155,26 @@ impl<'a> ProductKernel for BackwardTask<'a> {
             slopes,
             across,
         ] = scratch.cut(lens);
-        pack_across::<S, O>(simd, rows_of(inputs.query, 0..num_queries), width, queries_across);
-        pack_across::<S, O>(simd, rows_of(inputs.grad_output, 0..num_queries), width, grads_across);
+        pack_across::<S, O>(simd, rows_of(query, 0..num_queries), width, queries_across);
+        pack_across::<S, O>(simd, rows_of(grad_output, 0..num_queries), width, grads_across);
         let (queries, grads, query_row) = if O::PER_LANE > 1 {
-            pack_rows::<S, O>(simd, rows_of(inputs.query, 0..num_queries), inner, queries);
-            pack_rows::<S, O>(simd, rows_of(inputs.grad_output, 0..num_queries), inner, grads);
+            pack_rows::<S, O>(simd, rows_of(query, 0..num_queries), inner, queries);
+            pack_rows::<S, O>(simd, rows_of(grad_output, 0..num_queries), inner, grads);
             (&*queries, &*grads, inner)
         } else {
             (&*queries_across, &*grads_across, width)
         };
-        let outputs = rows_of(inputs.output, 0..num_queries).zip(rows_of(inputs.grad_output, 0..num_queries));
+        let outputs = rows_of(output, 0..num_queries).zip(rows_of(grad_output, 0..num_queries));
         for (to, (output, grad)) in delta.iter_mut().zip(outputs) {
             *to = output.iter().zip(grad).map(|(a, b)| a * b).sum();
         }
-        let log_sum = &inputs.log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
+        let log_sum = &log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
         for first_key in keys.clone().step_by(BACKWARD_KEYS) {
             let count = BACKWARD_KEYS.min(keys.end - first_key);
             let rows = first_key..first_key + count;
-            pack_transposed::<S, O>(simd, rows_of(inputs.key, rows.clone()), [inner, panel], keys_t);
-            pack_transposed::<S, O>(simd, rows_of(inputs.value, rows.clone()), [inner, panel], values_t);
-            pack_panels::<S, O>(simd, rows_of(inputs.key, rows), [key_lanes, panel], key_panels);
+            pack_transposed::<S, O>(simd, rows_of(key, rows.clone()), [inner, panel], keys_t);
+            pack_transposed::<S, O>(simd, rows_of(value, rows.clone()), [inner, panel], values_t);
+            pack_panels::<S, O>(simd, rows_of(key, rows), [key_lanes, panel], key_panels);
             key_sums.fill(0.0);
             value_sums.fill(0.0);
             for start in (0..num_queries).step_by(QUERY_BLOCK) {
@@ -223,7 +214,6 @@ impl<'a> ProductKernel for BackwardTask<'a> {
                 }
             }
         }
-        grad_query
     }
 }
 
@@ -266,6 +256,3 @@ fn score_gradients<S: Simd, O: Operands>(
         }
     }
 }
-
-#[cfg(test)]
-mod tests;

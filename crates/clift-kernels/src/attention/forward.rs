@@ -9,7 +9,7 @@ use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::packing::{lanes_of, pack_in_place, pack_panels, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
-use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
+use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
 use crate::simd::vector::{Operands, Simd};
 
 /// Keys per block: the scores of a block take 200 KB.
@@ -67,9 +67,7 @@ struct Forward<'a> {
     queries: Range<usize>,
 }
 
-impl<'a> ProductKernel for Forward<'a> {
-    type Output = ();
-
+impl<'a> Kernel for Forward<'a> {
     #[inline(always)]
     fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { sizes, inputs: [query, key, value], output, log_sum, scene, head, queries } = self;

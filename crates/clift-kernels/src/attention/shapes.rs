@@ -56,27 +56,11 @@ impl<'a> StridedRows<'a> {
     }
 }
 
-/// Destination of the gradients of an attention, in contiguous rows.
-#[derive(Debug)]
-pub enum AttentionGradients<'a> {
-    /// Gradients of queries, keys and values side by side: `[batch, num_queries, 3 dim]`.
-    Packed(&'a mut [f32]),
-    /// Gradients of the queries apart from those of keys and values.
-    Separate {
-        /// Gradients of the queries, `[batch, num_queries, dim]`.
-        query: &'a mut [f32],
-        /// Gradients of keys and values side by side: `[batch, num_keys, 2 dim]`.
-        key_value: &'a mut [f32],
-    },
-}
-
 /// Contiguous rows that several threads write, each thread its own heads.
 #[derive(Clone, Copy)]
 pub(crate) struct HeadBlocks<'a> {
     pub(crate) values: &'a SharedSlice<'a>,
-    /// Rows per scene.
     pub(crate) count: usize,
-    /// Values per row.
     pub(crate) width: usize,
     /// Position of the first head in a row.
     pub(crate) first: usize,

@@ -77,35 +77,19 @@ pub(crate) fn multiply<S: Simd, O: Operands>(
     }
 }
 
-/// Runs the largest tile that fits into `rows` rows and is `vectors` wide; returns its rows.
-///
-/// # Safety
-/// As [`Tile::run`].
+/// Runs the largest tile that fits into `rows` rows and is `vectors` wide, as [`Tile::run`]; returns its rows.
 #[inline(always)]
 unsafe fn run_tile<S: Simd, O: Operands>(simd: S, tile: Tile, rows: usize, vectors: usize) -> usize {
     // SAFETY: by the caller's promise.
     unsafe {
-        if vectors == S::TILE_VECTORS {
-            if rows >= S::TILE_ROWS {
-                simd.full_tile::<O>(tile);
-                return S::TILE_ROWS;
-            }
-            if rows >= 4 {
-                tile.run_vectors::<S, O, 4>(simd);
-                return 4;
-            }
-            tile.run_vectors::<S, O, 1>(simd);
-            return 1;
+        match (S::TILE_ROWS, vectors) {
+            (12, 2) if rows >= 12 => tile.run::<S, O, 12, 2>(simd),
+            (6, 2) if rows >= 6 => tile.run::<S, O, 6, 2>(simd),
+            (_, 2) if rows >= 4 => tile.run::<S, O, 4, 2>(simd),
+            (_, 2) => tile.run::<S, O, 1, 2>(simd),
+            (6 | 12, _) if rows >= 8 => tile.run::<S, O, 8, 1>(simd),
+            (_, _) if rows >= 4 => tile.run::<S, O, 4, 1>(simd),
+            (_, _) => tile.run::<S, O, 1, 1>(simd),
         }
-        if rows >= 8 {
-            tile.run::<S, O, 8, 1>(simd);
-            return 8;
-        }
-        if rows >= 4 {
-            tile.run::<S, O, 4, 1>(simd);
-            return 4;
-        }
-        tile.run::<S, O, 1, 1>(simd);
-        1
     }
 }

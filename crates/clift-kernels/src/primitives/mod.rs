@@ -3,11 +3,9 @@
 //! - `matmul`: matrix products that stay in the cache
 //! - `packing`: operands of matrix products, laid out for the register tile
 //! - `partition`: rows divided among tasks
-//! - `elementwise`: elementwise functions, one vector at a time
 //! - `scratch`: reusable buffers, one per thread
 //! - `shared_slice`: disjoint parallel writes to one slice
 
-pub(crate) mod elementwise;
 pub(crate) mod matmul;
 pub(crate) mod packing;
 pub(crate) mod partition;

@@ -6,7 +6,6 @@ pub(crate) const PIECE: usize = 1 << 14;
 /// Most parts of rows that are summed separately.
 const MAX_PARTS: usize = 64;
 
-/// Returns the rows of `width` values per task.
 pub(crate) fn rows_per_task(width: usize) -> usize {
     PIECE.div_ceil(width)
 }

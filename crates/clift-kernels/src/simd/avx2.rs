@@ -1,7 +1,7 @@
 //! AVX2 and FMA vectors.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx2` proves that the processor has AVX2 and FMA")]
 
-use crate::simd::vector::{Operands, Simd, Tile, binary_intrinsics};
+use crate::simd::vector::{Simd, binary_intrinsics};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
@@ -11,10 +11,7 @@ use std::arch::x86_64::*;
 pub struct Avx2(());
 
 impl Avx2 {
-    /// Creates the proof that the processor has the instructions.
-    ///
-    /// # Safety
-    /// The processor must have AVX2 and FMA.
+    /// Creates the proof that the processor has AVX2 and FMA.
     pub unsafe fn new() -> Self {
         Self(())
     }
@@ -79,9 +76,5 @@ impl Simd for Avx2 {
             let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
             _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
         }
-    }
-    #[inline(always)]
-    unsafe fn full_tile<O: Operands>(self, tile: Tile) {
-        unsafe { tile.run::<Self, O, 6, 2>(self) }
     }
 }

@@ -1,9 +1,7 @@
 //! AVX-512 vectors, with and without bf16.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx512` proves that the processor has AVX-512")]
 
-use crate::simd::vector::{
-    Operands, Simd, Tile, binary_intrinsics, emulated_dot_pairs, emulated_pairs, emulated_pairs_of_neighbours,
-};
+use crate::simd::vector::{Simd, binary_intrinsics, emulated_dot_pairs, emulated_pairs, emulated_pairs_of_neighbours};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
@@ -13,10 +11,7 @@ use std::arch::x86_64::*;
 pub struct Avx512<const BF16: bool>(());
 
 impl<const BF16: bool> Avx512<BF16> {
-    /// Creates the proof that the processor has the instructions.
-    ///
-    /// # Safety
-    /// The processor must have AVX-512 F, VL, BW and DQ, and BF16 if `BF16`.
+    /// Creates the proof that the processor has AVX-512 F, VL, BW and DQ, and BF16 if `BF16`.
     pub unsafe fn new() -> Self {
         Self(())
     }
@@ -111,9 +106,5 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
             let a = std::mem::transmute::<__m512, __m512bh>(a);
             _mm512_dpbf16_ps(sum, a, std::mem::transmute::<__m512, __m512bh>(b))
         }
-    }
-    #[inline(always)]
-    unsafe fn full_tile<O: Operands>(self, tile: Tile) {
-        unsafe { tile.run::<Self, O, 12, 2>(self) }
     }
 }

@@ -1,6 +1,6 @@
 //! Vectors in plain Rust.
 
-use crate::simd::vector::{Operands, Simd, Tile};
+use crate::simd::vector::Simd;
 
 /// Arrays of eight values in plain Rust, which the compiler vectorizes with baseline instructions.
 #[derive(Clone, Copy, Debug)]
@@ -78,10 +78,5 @@ impl Simd for Portable {
     #[inline(always)]
     fn largest(self, a: Self::V) -> f32 {
         a.into_iter().fold(f32::NEG_INFINITY, f32::max)
-    }
-    #[inline(always)]
-    unsafe fn full_tile<O: Operands>(self, tile: Tile) {
-        // SAFETY: by the caller's promise.
-        unsafe { tile.run::<Self, O, 4, 1>(self) }
     }
 }

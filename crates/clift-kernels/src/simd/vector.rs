@@ -15,17 +15,10 @@ pub trait Simd: Copy + Send + Sync + 'static {
     const TILE_VECTORS: usize;
     type V: Copy;
 
-    /// Returns a vector with the same value in every lane.
     fn splat(self, value: f32) -> Self::V;
-    /// Reads [`Simd::LANES`] values.
-    ///
-    /// # Safety
-    /// The values must be readable at `from`.
+    /// Reads [`Simd::LANES`] values, which must be readable.
     unsafe fn load(self, from: *const f32) -> Self::V;
-    /// Writes [`Simd::LANES`] values.
-    ///
-    /// # Safety
-    /// The values must be writable at `to`.
+    /// Writes [`Simd::LANES`] values, which must be writable.
     unsafe fn store(self, to: *mut f32, value: Self::V);
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
     fn sub(self, a: Self::V, b: Self::V) -> Self::V;
@@ -45,11 +38,6 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
     fn sum(self, a: Self::V) -> f32;
     fn largest(self, a: Self::V) -> f32;
-    /// Computes the full register tile of a matrix product: [`Simd::TILE_ROWS`] rows of [`Simd::TILE_VECTORS`] vectors.
-    ///
-    /// # Safety
-    /// As [`Tile::run`].
-    unsafe fn full_tile<O: Operands>(self, tile: Tile);
 
     /// Rounds both vectors to bf16 and returns pairs: in every lane the value of `first` in the lower half of the bits,
     /// that of `second` in the upper half.
@@ -96,26 +84,10 @@ pub trait Simd: Copy + Send + Sync + 'static {
         let count = to.len();
         to.copy_from_slice(&padded[..count]);
     }
-
-    /// `2^a` with a relative error of 2e-7. Results below `2^-126` are between zero and that value, results above `2^127`
-    /// become `2^127`. NaN stays NaN.
-    #[inline(always)]
-    fn exp2(self, a: Self::V) -> Self::V {
-        // Coefficients of exp2f in Cephes.
-        const COEFFICIENTS: [f32; 7] =
-            [1.535_336_2e-4, 1.339_887_5e-3, 9.618_437e-3, 5.550_332_5e-2, 2.402_264_8e-1, std::f32::consts::LN_2, 1.0];
-        exp2_by(self, a, COEFFICIENTS)
-    }
-
-    /// [`Simd::exp2`] with a relative error of 1e-4, exact for integers: for results that are rounded to bf16, 2e-3.
-    #[inline(always)]
-    fn exp2_for_bf16(self, a: Self::V) -> Self::V {
-        // The cubic with the least largest relative error in -0.5..=0.5.
-        exp2_by(self, a, [0.055_008_93, 0.242_210_96, 0.693_282_9, 1.0])
-    }
 }
 
-/// `2^a` by a polynomial of the distance to the nearest integer, highest power first.
+/// `2^a` by a polynomial of the distance to the nearest integer, highest power first. Results below `2^-126` are between zero
+/// and that value, results above `2^127` become `2^127`. NaN stays NaN.
 #[inline(always)]
 fn exp2_by<S: Simd, const COUNT: usize>(simd: S, a: S::V, coefficients: [f32; COUNT]) -> S::V {
     let bounded = simd.min(simd.splat(127.0), simd.max(simd.splat(-127.0), a));
@@ -128,17 +100,16 @@ fn exp2_by<S: Simd, const COUNT: usize>(simd: S, a: S::V, coefficients: [f32; CO
     simd.scale_by_power(power, whole)
 }
 
-/// Most lanes of any instruction set.
 pub(crate) const MAX_LANES: usize = 16;
 
-/// [`Simd::pairs`] without instructions for bf16: slow, a reference for tests.
+// Without instructions for bf16: slow, references for tests.
+
 #[inline(always)]
 pub(crate) fn emulated_pairs<S: Simd>(simd: S, first: S::V, second: S::V) -> S::V {
     let (first, second) = (array(simd, first), array(simd, second));
     simd.read(&std::array::from_fn::<_, MAX_LANES, _>(|lane| pair(first[lane], second[lane])))
 }
 
-/// [`Simd::pairs_of_neighbours`] without instructions for bf16.
 #[inline(always)]
 pub(crate) fn emulated_pairs_of_neighbours<S: Simd>(simd: S, first: S::V, second: S::V) -> S::V {
     let mut values = [0.0; 2 * MAX_LANES];
@@ -147,7 +118,6 @@ pub(crate) fn emulated_pairs_of_neighbours<S: Simd>(simd: S, first: S::V, second
     simd.read(&std::array::from_fn::<_, MAX_LANES, _>(|lane| pair(values[2 * lane], values[2 * lane + 1])))
 }
 
-/// [`Simd::dot_pairs`] without instructions for bf16.
 #[inline(always)]
 pub(crate) fn emulated_dot_pairs<S: Simd>(simd: S, a: S::V, b: S::V, sum: S::V) -> S::V {
     let (a, b, sum) = (array(simd, a), array(simd, b), array(simd, sum));
@@ -203,7 +173,10 @@ impl Operands for F32 {
     }
     #[inline(always)]
     fn exp2<S: Simd>(simd: S, a: S::V) -> S::V {
-        simd.exp2(a)
+        // Coefficients of exp2f in Cephes: a relative error of 2e-7.
+        const COEFFICIENTS: [f32; 7] =
+            [1.535_336_2e-4, 1.339_887_5e-3, 9.618_437e-3, 5.550_332_5e-2, 2.402_264_8e-1, std::f32::consts::LN_2, 1.0];
+        exp2_by(simd, a, COEFFICIENTS)
     }
     #[inline(always)]
     fn along<S: Simd>(simd: S, row: &[f32], lane: usize) -> S::V {
@@ -228,7 +201,8 @@ impl Operands for Bf16 {
     }
     #[inline(always)]
     fn exp2<S: Simd>(simd: S, a: S::V) -> S::V {
-        simd.exp2_for_bf16(a)
+        // The cubic with the least largest relative error in -0.5..=0.5: 1e-4, exact for integers.
+        exp2_by(simd, a, [0.055_008_93, 0.242_210_96, 0.693_282_9, 1.0])
     }
     #[inline(always)]
     fn along<S: Simd>(simd: S, row: &[f32], lane: usize) -> S::V {
@@ -270,13 +244,13 @@ pub struct Tile {
 }
 
 impl Tile {
-    /// Computes `ROWS` rows of `VECTORS` vectors, all in registers.
+    /// Computes `ROWS` rows of `VECTORS` vectors, all in registers; returns `ROWS`.
     ///
     /// # Safety
     /// All values of A, B and C in the range of the sizes must be readable, those of C writable.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "both loops unroll over constants")]
-    pub unsafe fn run<S: Simd, O: Operands, const ROWS: usize, const VECTORS: usize>(self, simd: S) {
+    pub unsafe fn run<S: Simd, O: Operands, const ROWS: usize, const VECTORS: usize>(self, simd: S) -> usize {
         let Self { inner, a, a_row, a_step, b, b_step, c, c_row, accumulate } = self;
         // SAFETY: the caller's promise covers every address below.
         unsafe {
@@ -301,21 +275,7 @@ impl Tile {
                 }
             }
         }
-    }
-
-    /// Computes `ROWS` rows of [`Simd::TILE_VECTORS`] vectors.
-    ///
-    /// # Safety
-    /// As [`Tile::run`].
-    #[inline(always)]
-    pub(crate) unsafe fn run_vectors<S: Simd, O: Operands, const ROWS: usize>(self, simd: S) {
-        // SAFETY: by the caller's promise.
-        unsafe {
-            match S::TILE_VECTORS {
-                1 => self.run::<S, O, ROWS, 1>(simd),
-                _ => self.run::<S, O, ROWS, 2>(simd),
-            }
-        }
+        ROWS
     }
 }
 
@@ -335,13 +295,11 @@ pub(crate) use binary_intrinsics;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::dispatch::{InstructionSet, OperandType, ProductKernel};
+    use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
 
     struct Exponentials<'a>(&'a mut [f32]);
 
-    impl ProductKernel for Exponentials<'_> {
-        type Output = ();
-
+    impl Kernel for Exponentials<'_> {
         #[inline(always)]
         fn run<S: Simd, O: Operands>(self, simd: S) {
             for values in self.0.chunks_mut(S::LANES) {

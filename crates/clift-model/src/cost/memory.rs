@@ -1,15 +1,14 @@
 //! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/guide/training.md).
 // x = N D: f32 values of the rows of a block
 
-use crate::cost::largest_tensor::kmeans_values;
 use crate::cost::parameters::Parameters;
 use crate::cost::scene_sizes::SceneSizes;
 use crate::network::blocks::feed_forward::Activation;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Rows, TARGETS_AND_TOKENS};
 use crate::ops::precision::Precision;
+use crate::tokens::kmeans::seeding::{MAX_TABLE_LEN, pool_len};
 
-/// Bytes of an f32.
 const F32: f64 = 4.0;
 /// Bytes of the C library's heap per byte that a backward pass keeps: the heap holds on to freed pieces below 32 MiB.
 /// Measured: 1.05 to 1.22 (docs/guide/training.md).
@@ -55,8 +54,6 @@ pub struct UpdateSizes {
     pub num_scenes: usize,
     /// Whether the gradients of several micro-batches are summed.
     pub is_accumulated: bool,
-    /// Whether every block stores only its input and recomputes the rest.
-    pub activation_checkpointing: bool,
     /// Precision of matrix products. In bf16 attention saves its inputs in bf16, a feed-forward network the input of its GELU.
     pub precision: Precision,
     /// Moments per value of a block's weight matrices: two with `AdamW`, one with Muon.
@@ -73,26 +70,22 @@ pub struct UpdateSizes {
 
 /// Returns the peak bytes of tensors during an update, with weights and optimizer.
 pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
-    let layers = config.layers();
-    let parameters = Parameters::of(config);
+    let (layers, parameters) = (config.layers(), Parameters::of(config));
     let trained = parameters.of_parts(sizes.trained) as f64;
     let images = (sizes.num_scenes * sizes.num_image_values) as f64;
     let earlier = if sizes.is_accumulated { trained } else { 0.0 };
     let backward = HEAP * peak(&segments(config, &layers, sizes), sizes.num_scenes) + images + earlier;
-    let matrix_len = |layer: &Layer| match layer.kind {
-        LayerKind::Linear { inputs, outputs, .. } => inputs * outputs,
-        _ => 0,
-    };
-    let in_blocks = layers.iter().filter(|layer| layer.block.is_some());
-    let largest_matrix = in_blocks.map(matrix_len).max().unwrap_or_default() as f64;
+    let matrices = layers.iter().filter(|layer| layer.block.is_some()).map(|layer| match layer.kind {
+        LayerKind::Linear { inputs, outputs, .. } => (layer.part, (inputs * outputs) as f64),
+        _ => (layer.part, 0.0),
+    });
+    let largest = matrices.clone().map(|(_, len)| len).fold(0.0, f64::max);
+    let in_trained: f64 = matrices.filter(|(part, _)| sizes.trained.contains(part)).map(|(_, len)| len).sum();
     // Gradients, and the copies of a block's largest matrix during its update.
-    let optimizer = trained + 5.0 * largest_matrix;
-    let in_trained_blocks =
-        layers.iter().filter(|layer| layer.block.is_some() && sizes.trained.contains(&layer.part)).map(matrix_len);
+    let optimizer = trained + 5.0 * largest;
     // Two moments of the trained weights, or fewer of matrices.
-    let moments = 2.0 * trained - (2 - sizes.matrix_moments) as f64 * in_trained_blocks.sum::<usize>() as f64;
-    let weights = parameters.total as f64 + sizes.loss_parameters + moments;
-    F32 * (weights + backward.max(optimizer))
+    let moments = 2.0 * trained - (2 - sizes.matrix_moments) as f64 * in_trained;
+    F32 * (parameters.total as f64 + sizes.loss_parameters + moments + backward.max(optimizer))
 }
 
 /// Returns the segments of a scene's share of an update, in the order of its forward pass.
@@ -130,7 +123,7 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
 /// Returns the segment of one block, or of consecutive layers outside the blocks. The kept values follow from the layers;
 /// the additional ones from a formula per kind of block, which agrees with measured peaks.
 fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_trained: bool) -> Segment {
-    let UpdateSizes { scene, activation_checkpointing, precision, .. } = sizes;
+    let UpdateSizes { scene, precision, .. } = sizes;
     let first = &layers[0];
     let values = |count: u64, width: usize| (count * width as u64) as f64;
     let x = values(scene.num_rows(first.rows), config.dim);
@@ -185,7 +178,6 @@ fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_train
             // Gradients of the residual stream and of the hidden values, and the recomputed norm.
             let working = (2.0 * x + hidden).max(cross_working - hidden) + restored;
             let forward = saved + hidden + cross_forward;
-            let (kept, working) = if *activation_checkpointing { (x, working + kept) } else { (kept, working) };
             Segment { kept, working, forward, parameters }
         }
         // Patches are gathered from images and rays, with 15 values per pixel in between.
@@ -237,8 +229,9 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     let patches = (sizes.num_encoder_rows * config.context_patch_len()) as f64;
     let rows = values(sizes.num_encoder_rows);
     let encode = (rows + forward_values(config, rows)).max(2.5 * patches + rows);
-    // Centered tokens and distances.
-    let distances = |num_clusters| 2.0 * x + kmeans_values(sizes.num_tokens, num_clusters) as f64;
+    // Centered tokens, and the table of distances that the seeding reads.
+    let pool = |num_clusters| pool_len(sizes.num_tokens, num_clusters, MAX_TABLE_LEN);
+    let distances = |num_clusters| 2.0 * x + (pool(num_clusters) as u64 * sizes.num_tokens as u64) as f64;
     let kmeans = sizes.num_clusters.map_or(0.0, distances);
     let render = match sizes.num_targets {
         0 => 0.0,
@@ -274,40 +267,33 @@ fn render_values(config: &ModelConfig, x: f64, num_views: usize, y: f64) -> f64 
 mod tests {
     use super::*;
 
-    fn update(trained: &'static [Part], activation_checkpointing: bool) -> UpdateSizes {
-        let scene = SceneSizes::new(4096, 1, 1024);
-        let stored = SceneSizes { num_storage_tokens: Some(1024), num_render_tokens: 1024, ..scene };
-        UpdateSizes {
-            trained,
-            num_scenes: 1,
-            is_accumulated: false,
-            activation_checkpointing,
-            precision: Precision::F32,
-            matrix_moments: 2,
-            scene: if trained == STAGE2 { stored } else { scene },
-            num_image_values: 5 * 256 * 256 * 3,
-            loss: Segment::default(),
-            loss_parameters: 0.0,
-        }
-    }
-
-    const STAGE1: &[Part] = &[Part::Encoder, Part::Renderer];
-    const STAGE2: &[Part] = &[Part::Condenser, Part::Renderer];
-
     #[test]
     fn update_bytes_are_within_15_percent_of_measured_peaks() {
+        const STAGE1: &[Part] = &[Part::Encoder, Part::Renderer];
+        const STAGE2: &[Part] = &[Part::Condenser, Part::Renderer];
         // docs/results/performance.md, full size, batch 1; the process holds 26 MB besides its tensors.
         let config = ModelConfig::default();
-        for (trained, checkpointing, precision, measured) in [
-            (STAGE1, false, Precision::F32, 2.26e9),
-            (STAGE1, false, Precision::Bf16, 2.03e9),
-            (STAGE1, true, Precision::F32, 1.72e9),
-            (STAGE2, false, Precision::F32, 1.43e9),
+        let scene = SceneSizes::new(4096, 1, 1024);
+        let stored = SceneSizes { num_storage_tokens: Some(1024), num_render_tokens: 1024, ..scene };
+        for (trained, precision, scene, measured) in [
+            (STAGE1, Precision::F32, scene, 2.26e9),
+            (STAGE1, Precision::Bf16, scene, 2.03e9),
+            (STAGE2, Precision::F32, stored, 1.43e9),
         ] {
-            let one = UpdateSizes { precision, ..update(trained, checkpointing) };
+            let one = UpdateSizes {
+                trained,
+                num_scenes: 1,
+                is_accumulated: false,
+                precision,
+                matrix_moments: 2,
+                scene,
+                num_image_values: 5 * 256 * 256 * 3,
+                loss: Segment::default(),
+                loss_parameters: 0.0,
+            };
             let predicted = update_bytes(&config, &one) + 26e6;
             let error = (predicted / measured - 1.0).abs();
-            assert!(error < 0.15, "{trained:?} {checkpointing} {precision}: {predicted:.3e} for {measured:.3e}");
+            assert!(error < 0.15, "{one:?}: {predicted:.3e} for {measured:.3e}");
             let muon = UpdateSizes { matrix_moments: 1, ..one };
             assert!(update_bytes(&config, &muon) < update_bytes(&config, &one), "one moment less per matrix");
             for more in [UpdateSizes { num_scenes: 2, ..one }, UpdateSizes { is_accumulated: true, ..one }] {
@@ -317,36 +303,12 @@ mod tests {
     }
 
     #[test]
-    fn blocks_save_the_inputs_of_their_layers() {
-        // Rows of width D: encoder 6 and F; renderer 9 and F, and keys and values of its tokens; condenser 10 and F,
-        // and keys and values of its members.
-        let config = ModelConfig::default();
-        let layers = config.layers();
-        let sizes = update(STAGE2, false);
-        let [dim, hidden] = [config.dim, config.feed_forward_dim].map(|width| width as f64);
-        let x = |rows: f64, count: f64| rows * (count * dim + hidden);
-        for (part, expected) in [
-            (Part::Encoder, x(4096.0, 6.0)),
-            (Part::Renderer, x(1024.0, 9.0) + 2.0 * 1024.0 * dim),
-            (Part::Condenser, x(1024.0, 10.0) + 2.0 * 3072.0 * dim),
-        ] {
-            let mut groups = layers.chunk_by(|a, b| (a.part, a.block) == (b.part, b.block));
-            let layers = groups.find(|layers| layers[0].part == part && layers[0].block.is_some()).expect("a block");
-            assert_eq!(segment(&config, layers, &sizes, true).kept, expected, "{part:?}");
-        }
-    }
-
-    #[test]
     fn peak_is_the_largest_sum_of_kept_working_and_gradients() {
         let segment = |kept, working, forward, parameters| Segment { kept, working, forward, parameters };
-        assert_eq!(peak(&[], 1), 0.0);
-        // At the start of the backward.
+        // At the start of the backward, at its end by the gradients, the same of two scenes, and in the forward.
         assert_eq!(peak(&[segment(5.0, 1.0, 0.0, 1.0), segment(5.0, 2.0, 0.0, 1.0)], 1), 13.0);
-        // At its end, by the gradients.
         assert_eq!(peak(&[segment(1.0, 1.0, 0.0, 10.0), segment(1.0, 1.0, 0.0, 10.0)], 1), 22.0);
-        // The same of two scenes: gradients of parameters are summed.
         assert_eq!(peak(&[segment(1.0, 1.0, 0.0, 10.0), segment(1.0, 1.0, 0.0, 10.0)], 2), 24.0);
-        // In the forward.
         assert_eq!(peak(&[segment(1.0, 0.0, 9.0, 0.0), segment(2.0, 1.0, 0.0, 0.0)], 1), 9.0);
     }
 }

@@ -9,8 +9,6 @@ use crate::network::layers::{Part, Rows};
 pub struct SceneSizes {
     /// Patches of all context views.
     pub num_context_patches: usize,
-    /// Groups of context views that the encoder reads one by one.
-    pub num_context_groups: usize,
     /// Encoder tokens.
     pub num_tokens: usize,
     /// Storage tokens; `None` without a condenser.
@@ -30,7 +28,6 @@ impl SceneSizes {
     pub fn new(num_tokens: usize, num_targets: usize, num_patches: usize) -> Self {
         Self {
             num_context_patches: num_tokens,
-            num_context_groups: 1,
             num_tokens,
             num_storage_tokens: None,
             num_render_tokens: num_tokens,
@@ -42,9 +39,6 @@ impl SceneSizes {
 
     /// Returns the sizes of a scene of a network, with views of `height` by `width` pixels, whose target views are rendered
     /// from all its tokens.
-    ///
-    /// # Errors
-    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn of(
         config: &ModelConfig,
         num_context: usize,
@@ -54,8 +48,7 @@ impl SceneSizes {
         let num_tokens = config.num_tokens(num_context, height, width)?;
         let num_context_patches = config.num_patches(num_context, height, width)?;
         let num_patches = config.num_patches(1, height, width)?;
-        let num_context_groups = config.num_groups(num_context);
-        Ok(Self { num_context_patches, num_context_groups, ..Self::new(num_tokens, num_targets, num_patches) })
+        Ok(Self { num_context_patches, ..Self::new(num_tokens, num_targets, num_patches) })
     }
 
     /// Returns the most rows of a layer of the encoder.
@@ -71,27 +64,20 @@ impl SceneSizes {
         if self.is_per_view { all.min(self.num_targets * self.num_render_tokens) } else { self.num_render_tokens }
     }
 
-    /// Number of groups of rows. Attention stays inside a group: target views do not attend to each other, nor do groups of
-    /// context views.
+    /// Number of groups of rows. Attention stays inside a group: target views do not attend to each other.
     pub(crate) fn num_groups(&self, rows: &[Rows]) -> u64 {
         let is_per_view = |rows: &Rows| match rows {
             Rows::TargetPatches => true,
             Rows::RenderTokens => self.is_per_view,
             _ => false,
         };
-        if rows.iter().any(is_per_view) {
-            self.num_targets as u64
-        } else if rows == [Rows::ContextPatches] {
-            self.num_context_groups as u64
-        } else {
-            1
-        }
+        if rows.iter().any(is_per_view) { self.num_targets as u64 } else { 1 }
     }
 
     pub(crate) fn group_len(&self, rows: &[Rows]) -> u64 {
         let stored = self.num_storage_tokens.unwrap_or(0);
         let len = |rows: &Rows| match rows {
-            Rows::ContextPatches => self.num_context_patches / self.num_context_groups,
+            Rows::ContextPatches => self.num_context_patches,
             Rows::Latents => self.num_tokens,
             Rows::Members => self.num_tokens.saturating_sub(stored),
             Rows::StoredTokens | Rows::GatheringTokens => stored,

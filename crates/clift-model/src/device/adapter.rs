@@ -22,32 +22,10 @@ pub struct Adapter {
     pub selector: String,
     /// Whether the device `wgpu` is this adapter.
     pub is_used: bool,
-    /// Limits of the adapter.
-    pub limits: Limits,
+    /// Most bytes of one tensor, which is bound as a single buffer. `CubeCL` requests the limits of the adapter.
+    pub max_tensor_bytes: u64,
     /// Whether shaders support f16 in arithmetic and buffers.
     pub has_f16: bool,
-}
-
-/// Limits of an adapter. `CubeCL` requests the limits of the adapter, not the defaults of WebGPU.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
-    /// Most bytes of a storage buffer binding.
-    pub max_binding_bytes: u64,
-    /// Most bytes of a buffer.
-    pub max_buffer_bytes: u64,
-    /// Most threads per workgroup.
-    pub max_workgroup_threads: u32,
-    /// Most bytes of shared memory per workgroup.
-    pub max_workgroup_bytes: u32,
-    /// Most workgroups per dimension of a launch.
-    pub max_workgroups: u32,
-}
-
-impl Limits {
-    /// Returns the most bytes of one tensor, which is bound as a single buffer.
-    pub fn max_tensor_bytes(&self) -> u64 {
-        self.max_binding_bytes.min(self.max_buffer_bytes)
-    }
 }
 
 /// Returns the most bytes of one tensor on an open device; `None` if memory is the only limit.
@@ -87,7 +65,6 @@ pub fn product_instructions(_device: &Device) -> Option<String> {
 }
 
 impl fmt::Display for Adapter {
-    /// Writes name, kind, API and driver.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { name, kind, api, driver, .. } = self;
         write!(f, "{name} ({kind}, {api}, driver {driver})")
@@ -114,7 +91,7 @@ mod available {
     use burn_cubecl::cubecl::future::block_on;
     use wgpu::{DeviceType, Instance, InstanceDescriptor, PowerPreference, RequestAdapterOptions};
 
-    use super::{ADAPTER_VARIABLE, Adapter, Limits};
+    use super::{ADAPTER_VARIABLE, Adapter};
 
     /// Returns the adapters that the device `wgpu` can use: those of the first graphics API with a GPU, or else of the
     /// first with any adapter.
@@ -159,13 +136,7 @@ mod available {
                 driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
                 selector,
                 is_used,
-                limits: Limits {
-                    max_binding_bytes: limits.max_storage_buffer_binding_size,
-                    max_buffer_bytes: limits.max_buffer_size,
-                    max_workgroup_threads: limits.max_compute_invocations_per_workgroup,
-                    max_workgroup_bytes: limits.max_compute_workgroup_storage_size,
-                    max_workgroups: limits.max_compute_workgroups_per_dimension,
-                },
+                max_tensor_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
                 has_f16: adapter.features().contains(wgpu::Features::SHADER_F16),
                 name: info.name,
             });

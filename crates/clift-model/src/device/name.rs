@@ -1,7 +1,6 @@
 //! Device names, and opening a device.
 
 use burn::tensor::Device;
-use clift_kernels::{InstructionSet, InstructionSetError};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -49,21 +48,9 @@ impl DeviceName {
     }
 
     /// Opens the device, without autodiff.
-    ///
-    /// # Errors
-    /// [`ModelError::NoDevice`] if this build does not contain the device or no adapter is found;
-    /// [`ModelError::BadConfig`] for an invalid value of [`InstructionSet::VARIABLE`].
     pub fn open(self) -> Result<Device, ModelError> {
         match self {
-            Self::Flex => {
-                let bad = |bad: InstructionSetError| ModelError::BadConfig {
-                    key: InstructionSet::VARIABLE,
-                    fix: bad.to_string(),
-                    value: bad.text,
-                };
-                InstructionSet::forced().map_err(bad)?;
-                Ok(Device::flex())
-            }
+            Self::Flex => Ok(Device::flex()),
             #[cfg(feature = "ndarray")]
             Self::Ndarray => Ok(Device::ndarray()),
             #[cfg(not(feature = "ndarray"))]
@@ -155,20 +142,4 @@ fn open_wgpu() -> Result<Device, ModelError> {
         }
     }
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_device_that_is_not_built_names_its_feature() {
-        for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
-            let message = name.open().unwrap_err().to_string();
-            assert!(
-                message.contains(&format!("`cargo build --release --features {name}`, or choose `flex`")),
-                "{message}"
-            );
-        }
-    }
 }

@@ -3,7 +3,6 @@
 
 use std::path::Path;
 
-use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
 use crate::error::ModelError;
@@ -22,7 +21,6 @@ const WANTED: WeightFileSpec = WeightFileSpec { what: "LPIPS", format: "clift-lp
 
 /// Mean of the network's inputs, for values in [-1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
-/// Standard deviation of the inputs.
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 
 /// Added to the norm of a position, which is zero without activation.
@@ -44,16 +42,13 @@ pub struct LpipsFeatures(Vec<Tensor<4>>);
 
 impl Lpips {
     /// Reads the weights.
-    ///
-    /// # Errors
-    /// [`ModelError::BadWeights`] with the command that makes the file.
     pub fn load(path: &Path, device: &Device) -> Result<Self, ModelError> {
         Self::with_shape(path, VggShape::VGG16, (device, DType::F32))
     }
 
     fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, ModelError> {
         let mut file = NetworkFile::read(path, WANTED)?;
-        let vgg = Vgg::take(&mut file, shape, options)?.no_grad();
+        let vgg = Vgg::take(&mut file, shape, options)?;
         let head = |(stage, channels): (usize, usize)| {
             let head = file.take(&format!("head{}.weight", stage + 1), [channels], options)?;
             Ok(head.reshape([1, channels, 1, 1]))
@@ -68,9 +63,6 @@ impl Lpips {
     }
 
     /// Computes the features of an image, `[height, width, 3]` in `[0, 1]`; other values are not clamped.
-    ///
-    /// # Errors
-    /// [`ModelError::BadImage`], also below 16 x 16 pixels.
     pub fn features(&self, image: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, ModelError> {
         check_images(image, image, height * width * 3)?;
         check_size("LPIPS", LPIPS_MIN_SIZE_PX, height, width)?;
@@ -89,9 +81,6 @@ impl Lpips {
     }
 
     /// Returns the distance of two images of the same size; 0 for identical images.
-    ///
-    /// # Errors
-    /// [`ModelError::Device`] when the device fails.
     pub fn distance(&self, a: &LpipsFeatures, b: &LpipsFeatures) -> Result<f64, ModelError> {
         let stages = (0..NUM_STAGES).map(|stage| {
             let squared = (a.0[stage].clone() - b.0[stage].clone()).square() * self.heads[stage].clone();
@@ -117,10 +106,8 @@ impl LpipsFeatures {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::device::name::DeviceName;
-    use crate::metrics::image_metrics::{psnr, ssim};
     use crate::metrics::vgg::tests::NARROW;
-    use crate::testing::Fixture;
+    use crate::testing::{Fixture, devices};
 
     fn narrow(device: &Device) -> Lpips {
         let path = Fixture::path("lpips_weights");
@@ -129,21 +116,18 @@ mod tests {
 
     fn check_fixture(lpips: &Lpips, fixture: &Fixture, tolerance: f64) {
         let mut most = 0.0_f64;
-        let pairs = fixture.names("output.psnr.");
+        let pairs = fixture.names("output.lpips.");
         assert!(!pairs.is_empty(), "an empty fixture checks nothing");
         for pair in pairs {
             let shape = fixture.shape(&format!("input.target.{pair}"));
             let [height, width, 3] = shape[..] else { panic!("{shape:?}") };
             let image = |kind: &str| fixture.f32s(&format!("input.{kind}.{pair}"));
             let (pred, target) = (image("prediction"), image("target"));
-            let expected = |metric: &str| fixture.f64s(&format!("output.{metric}.{pair}"))[0];
             let distance = lpips.measure(&pred, &target, height, width).unwrap();
-            let error = (distance - expected("lpips")).abs();
-            assert!(error <= tolerance, "{pair}: {distance} is not {}", expected("lpips"));
+            let expected = fixture.f64s(&format!("output.lpips.{pair}"))[0];
+            let error = (distance - expected).abs();
+            assert!(error <= tolerance, "{pair}: {distance} is not {expected}");
             most = most.max(error);
-            let (psnr, ssim) = (psnr(&pred, &target).unwrap(), ssim(&pred, &target, height, width).unwrap());
-            assert!(psnr == expected("psnr") || (psnr - expected("psnr")).abs() <= 1e-4, "{pair}: {psnr} dB");
-            assert!((ssim - expected("ssim")).abs() <= 1e-5, "{pair}: SSIM {ssim}");
         }
         println!("largest error of LPIPS {most:.1e}");
     }
@@ -151,7 +135,7 @@ mod tests {
     #[test]
     fn narrow_networks_equal_pytorch() {
         let fixture = Fixture::open("lpips");
-        for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
+        for device in devices() {
             // Distances are 0.01 to 1; 13 layers in f32 have a relative error of 1e-6.
             check_fixture(&narrow(&device), &fixture, 1e-5);
         }
@@ -167,22 +151,10 @@ mod tests {
     }
 
     #[test]
-    fn identical_images_have_distance_zero() {
-        let lpips = narrow(&Device::flex());
-        for value in [0.0, 0.5, 1.0] {
-            let flat = vec![value; 17 * 19 * 3];
-            assert_eq!(lpips.measure(&flat, &flat, 17, 19).unwrap(), 0.0);
-        }
-        let distance = lpips.measure(&[0.0; 17 * 19 * 3], &[1.0; 17 * 19 * 3], 17, 19).unwrap();
-        assert!(distance.is_finite() && distance > 0.0, "{distance}");
-    }
-
-    #[test]
     fn bad_images_and_weights_are_errors() {
         let lpips = narrow(&Device::flex());
         let message = lpips.measure(&[0.5; 15 * 40 * 3], &[0.5; 15 * 40 * 3], 15, 40).unwrap_err().to_string();
         assert_eq!(message, "LPIPS needs at least 16 x 16 pixels, got 40 x 15");
-        assert!(lpips.measure(&[0.5; 7], &[0.5; 16 * 16 * 3], 16, 16).is_err());
         assert!(lpips.measure(&[f32::NAN; 16 * 16 * 3], &[0.5; 16 * 16 * 3], 16, 16).is_err());
         for (file, part) in [("lpips_weights", "conv1_1.weight has shape"), ("perceptual_weights", "clift-vgg19-1")] {
             let message = Lpips::load(&Fixture::path(file), &Device::flex()).unwrap_err().to_string();

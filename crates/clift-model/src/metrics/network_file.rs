@@ -99,58 +99,44 @@ mod tests {
     use safetensors::tensor::TensorView;
 
     use super::*;
+    use crate::testing::to_vec;
 
     const WANTED: WeightFileSpec = WeightFileSpec { what: "LPIPS", format: "test-1", command: "convert it" };
 
-    fn written(folder: &Path, format: &str, values: &[f32]) -> PathBuf {
+    fn written(path: &Path, format: &str, values: &[f32]) {
         let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let view = TensorView::new(Dtype::F32, vec![values.len()], &bytes).unwrap();
         let metadata = HashMap::from([("format".to_owned(), format.to_owned())]);
-        let path = folder.join(format!("{format}-{}.safetensors", values.len()));
-        std::fs::write(&path, safetensors::serialize([("head1.weight", view)], Some(metadata)).unwrap()).unwrap();
-        path
+        std::fs::write(path, safetensors::serialize([("head1.weight", view)], Some(metadata)).unwrap()).unwrap();
     }
 
     #[test]
-    fn tensors_are_taken_completely_with_their_shapes() {
+    fn files_are_taken_completely_and_wrong_ones_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let path = written(folder.path(), "test-1", &[1.0, 2.0]);
-        let device = Device::flex();
+        let path = folder.path().join("weights.safetensors");
+        let refused = |part: &str, result: Result<NetworkFile, ModelError>| {
+            let message = result.err().expect("refused").to_string();
+            assert!(message.starts_with("bad weights for LPIPS: ") && message.contains(part), "{message}");
+            assert!(message.contains("`convert it`") && message.ends_with("weights.safetensors"), "{message}");
+        };
+        refused("No such file", NetworkFile::read(&path, WANTED));
+        written(&path, "test-1", &[1.0, 2.0]);
+        let options = (&Device::flex(), DType::F32);
         let open = || NetworkFile::read(&path, WANTED).unwrap();
         let mut file = open();
-        let tensor = file.take("head1.weight", [2], (&device, DType::F32)).unwrap();
-        assert_eq!(tensor.into_data().try_to_vec::<f32>().unwrap(), [1.0, 2.0]);
+        assert_eq!(to_vec(file.take("head1.weight", [2], options).unwrap()), [1.0, 2.0]);
         assert_eq!(file.finish().unwrap().len(), 64);
-        let messages = [
-            open().take("head2.weight", [2], (&device, DType::F32)).unwrap_err(),
-            open().take("head1.weight", [3], (&device, DType::F32)).unwrap_err(),
-            open().finish().unwrap_err(),
-        ]
-        .map(|error| error.to_string());
-        for (message, part) in
-            messages.iter().zip(["head2.weight is missing", "expected [3]", "is not part of the network"])
-        {
-            assert!(message.starts_with("bad weights for LPIPS: ") && message.contains(part), "{message}");
-            assert!(message.contains("`convert it`") && message.ends_with("test-1-2.safetensors"), "{message}");
+        let take = |name: &str, len: usize| open().take::<1>(name, [len], options).map(|_| open());
+        refused("head2.weight is missing", take("head2.weight", 2));
+        refused("expected [3]", take("head1.weight", 3));
+        refused("is not part of the network", open().finish().map(|_| open()));
+        for len in [std::fs::metadata(&path).unwrap().len() - 2, 0] {
+            std::fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(len).unwrap();
+            refused("", NetworkFile::read(&path, WANTED));
         }
-    }
-
-    #[test]
-    fn wrong_and_broken_files_are_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let other = written(folder.path(), "test-2", &[1.0]);
-        let nan = written(folder.path(), "test-1", &[f32::NAN; 3]);
-        let cut = folder.path().join("cut.safetensors");
-        let bytes = std::fs::read(&other).unwrap();
-        std::fs::write(&cut, &bytes[..bytes.len() - 2]).unwrap();
-        let empty = folder.path().join("empty.safetensors");
-        std::fs::write(&empty, "").unwrap();
-        let missing = folder.path().join("missing.safetensors");
-        for (path, part) in
-            [(&other, "test-2"), (&nan, "a NaN or an infinity"), (&cut, ""), (&empty, ""), (&missing, "No such file")]
-        {
-            let Err(error) = NetworkFile::read(path, WANTED) else { panic!("{} is accepted", path.display()) };
-            assert!(error.to_string().contains(part), "{error}");
-        }
+        written(&path, "test-2", &[1.0]);
+        refused("test-2", NetworkFile::read(&path, WANTED));
+        written(&path, "test-1", &[f32::NAN]);
+        refused("a NaN or an infinity", NetworkFile::read(&path, WANTED));
     }
 }

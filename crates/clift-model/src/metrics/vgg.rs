@@ -1,9 +1,6 @@
 //! VGG features: 3 x 3 convolutions in five stages with pooling between the stages.
 // B images, C channels, H rows, W columns
 
-use burn::module::{Module, Param};
-use burn::nn::PaddingConfig2d;
-use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::tensor::activation::relu;
 use burn::tensor::module::{avg_pool2d, max_pool2d};
 use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
@@ -22,9 +19,7 @@ pub const MIN_SIZE_PX: usize = 1 << (NUM_STAGES - 1);
 /// Pooling over 2 x 2 values. An odd last row or column is dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pooling {
-    /// The maximum.
     Max,
-    /// The mean.
     Average,
 }
 
@@ -57,9 +52,7 @@ impl VggShape {
 /// Cost of a network for one image, in f32 values and multiply-accumulates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VggSizes {
-    /// Parameters.
     pub parameters: f64,
-    /// Multiply-accumulates of a forward pass.
     pub macs: f64,
     /// Output values of all convolutions and poolings.
     pub outputs: f64,
@@ -93,39 +86,28 @@ impl VggShape {
     }
 }
 
-/// A frozen network.
-#[derive(Module, Debug)]
+/// A frozen network: weight `[outputs, inputs, 3, 3]` and bias of every convolution of every stage.
+#[derive(Clone, Debug)]
 pub struct Vgg {
-    stages: Vec<Vec<Conv2d>>,
-    #[module(skip)]
+    stages: Vec<Vec<(Tensor<4>, Tensor<1>)>>,
     shape: VggShape,
 }
 
 impl Vgg {
-    /// Makes a network with random weights.
-    pub fn random(shape: VggShape, device: &Device) -> Self {
-        let mut inputs = 3;
-        let mut conv = |outputs| {
-            let config = Conv2dConfig::new([inputs, outputs], [3, 3]);
-            inputs = outputs;
-            config.with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1)).init(device)
-        };
-        let stages = shape.convs.iter().zip(&shape.widths);
-        Self { stages: stages.map(|(&count, &outputs)| (0..count).map(|_| conv(outputs)).collect()).collect(), shape }
-    }
-
-    /// Takes the tensors `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias` out of a file.
+    /// Takes the tensors `convS_I.weight` and `convS_I.bias` out of a file.
     pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, ModelError> {
-        let mut vgg = Self::random(shape, options.0);
-        for (stage, convs) in vgg.stages.iter_mut().enumerate() {
-            for (i, conv) in convs.iter_mut().enumerate() {
-                let name = format!("conv{}_{}", stage + 1, i + 1);
-                let dims = conv.weight.dims();
-                conv.weight = frozen(file.take(&format!("{name}.weight"), dims, options)?);
-                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [dims[0]], options)?));
+        let (mut stages, mut inputs) = (Vec::new(), 3);
+        for (stage, (&count, &outputs)) in shape.convs.iter().zip(&shape.widths).enumerate() {
+            let mut convs = Vec::new();
+            for i in 1..=count {
+                let name = format!("conv{}_{i}", stage + 1);
+                let weight = file.take(&format!("{name}.weight"), [outputs, inputs, 3, 3], options)?;
+                convs.push((weight, file.take(&format!("{name}.bias"), [outputs], options)?));
+                inputs = outputs;
             }
+            stages.push(convs);
         }
-        Ok(vgg)
+        Ok(Self { stages, shape })
     }
 
     /// # Shapes
@@ -136,11 +118,13 @@ impl Vgg {
         let mut features = Vec::new();
         for (stage, convs) in self.stages.iter().enumerate() {
             if stage > 0 {
-                x = self.shape.pooling.downsample(x); // [B, C, H, W] -> [B, C, H/2, W/2]
+                x = match self.shape.pooling {
+                    Pooling::Max => max_pool2d(x, MaxPoolOptions::new([2, 2])),
+                    Pooling::Average => avg_pool2d(x, AvgPoolOptions::new([2, 2])),
+                }; // [B, C, H, W] -> [B, C, H/2, W/2]
             }
-            for (i, conv) in convs.iter().enumerate() {
-                let bias = conv.bias.as_ref().expect("every convolution has a bias");
-                x = relu(convolution(x, conv.weight.val(), bias.val()));
+            for (i, (weight, bias)) in convs.iter().enumerate() {
+                x = relu(convolution(x, weight.clone(), bias.clone()));
                 if i + 1 == self.shape.taps[stage] {
                     features.push(x.clone());
                 }
@@ -148,19 +132,6 @@ impl Vgg {
         }
         features
     }
-}
-
-impl Pooling {
-    fn downsample(self, x: Tensor<4>) -> Tensor<4> {
-        match self {
-            Self::Max => max_pool2d(x, MaxPoolOptions::new([2, 2])),
-            Self::Average => avg_pool2d(x, AvgPoolOptions::new([2, 2])),
-        }
-    }
-}
-
-fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
-    Param::from_tensor(tensor).set_require_grad(false)
 }
 
 #[cfg(test)]

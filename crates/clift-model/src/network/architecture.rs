@@ -36,6 +36,12 @@ impl Architecture {
     /// All architectures, in the order of messages and help texts.
     pub const ALL: &[Self] = Self::VARIANTS;
 
+    /// Whether tokens can be clustered and condensed. Other networks are trained in stage 1 alone, and a scene of theirs is stored
+    /// with all its tokens.
+    pub fn supports_clusters(self) -> bool {
+        self == Self::Clift
+    }
+
     /// Returns the name among the methods of an evaluation.
     pub const fn method_name(self) -> &'static str {
         match self {
@@ -45,18 +51,16 @@ impl Architecture {
     }
 }
 
-/// Variant of the network: as in its paper, or as in the released code.
+/// Variant of the network: as in its paper, or as in the released code. LVSM has that of its paper.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum CliftVariant {
-    /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3). Of LVSM, the blocks of its own
-    /// paper: no biases, RMS norms of queries and keys.
+    /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
     #[default]
     Paper,
     /// The released code's network for `RealEstate10K`. Its condenser is one pre-norm decoder layer with `ReLU`, whose keys
-    /// and values are all tokens of the cluster without a norm, followed by a gate with bias. Of LVSM, the narrower network
-    /// in `CLiFT`'s release: stock pre-norm blocks.
+    /// and values are all tokens of the cluster without a norm, followed by a gate with bias.
     ReleasedRe10k,
     /// The released code's network for DL3DV: [`CliftVariant::ReleasedRe10k`] with an RMS norm of every head's queries and
     /// keys in encoder and renderer, and a layer norm after the encoder.
@@ -66,11 +70,6 @@ pub enum CliftVariant {
 impl CliftVariant {
     /// All variants, in the order of messages and help texts.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
-
-    /// Returns the name in configs and on the command line.
-    pub fn as_str(self) -> &'static str {
-        self.into()
-    }
 
     /// Whether the network is one of the released code's.
     pub fn is_released(self) -> bool {
@@ -93,13 +92,11 @@ pub enum CameraEncoding {
     Plucker,
     /// Camera-relative attention by the poses of the cameras.
     Gta,
-    /// Camera-relative attention by the projections of the cameras: pose and intrinsics.
-    Prope,
 }
 
 impl CameraEncoding {
     /// All encodings, in the order of messages and help texts.
-    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+    pub const ALL: [Self; 2] = *Self::VARIANTS.as_array().expect("two variants");
 }
 
 impl std::str::FromStr for CliftVariant {

@@ -1,4 +1,6 @@
 //! Sizes of the networks: the `[model]` section of a config.
+//!
+//! The rest of the program asks what a network can do, such as [`ModelConfig::has_patch_tokens`], not which one it is.
 
 use std::fmt::Display;
 
@@ -32,15 +34,11 @@ pub struct ModelConfig {
     pub num_renderer_blocks: usize,
     /// Side of a patch in pixels; every patch is one token.
     pub patch_size: usize,
-    /// How attention knows the cameras: `plucker` (by the rays of the input alone), `gta` (by poses too) or `prope` (by poses and
-    /// intrinsics too).
+    /// How attention knows the cameras: `plucker` (by the rays of the input alone) or `gta` (by poses too).
     pub camera_encoding: CameraEncoding,
     /// Frame of the rays of the input: `world`, or `camera` with camera-relative attention, which makes the network independent
     /// of the frame of the scene.
     pub rays: RayFrame,
-    /// Most context views that the encoder reads together: more are divided, in their order, into the fewest equal groups. 0
-    /// reads all views together.
-    pub group_size: usize,
     /// Number of renderings, with patches shifted along the diagonal, whose mean is an image: 1, 2 or 4. Training renders an
     /// image once.
     pub patch_grids: PatchGrids,
@@ -62,7 +60,7 @@ pub struct CondenserConfig {
 }
 
 /// The published size of `CLiFT`, without a condenser.
-pub(crate) const SIZES: ModelConfig = ModelConfig {
+const SIZES: ModelConfig = ModelConfig {
     architecture: Architecture::Clift,
     variant: CliftVariant::Paper,
     num_latents: 0,
@@ -74,7 +72,6 @@ pub(crate) const SIZES: ModelConfig = ModelConfig {
     patch_size: 8,
     camera_encoding: CameraEncoding::Plucker,
     rays: RayFrame::World,
-    group_size: 0,
     patch_grids: PatchGrids::One,
     condenser: CondenserConfig::NONE,
 };
@@ -98,33 +95,93 @@ impl CondenserConfig {
 /// [`ModelConfig`] in a file. Defaults of sizes depend on architecture and variant.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(crate) struct ModelSection {
-    pub architecture: Architecture,
-    pub variant: CliftVariant,
-    pub num_latents: Option<usize>,
-    pub dim: Option<usize>,
-    pub num_heads: Option<usize>,
-    pub feed_forward_dim: Option<usize>,
-    pub num_encoder_blocks: Option<usize>,
-    pub num_renderer_blocks: Option<usize>,
-    pub patch_size: Option<usize>,
-    pub camera_encoding: CameraEncoding,
-    pub rays: RayFrame,
-    pub group_size: usize,
-    pub patch_grids: PatchGrids,
-    pub condenser: CondenserSection,
+struct ModelSection {
+    architecture: Architecture,
+    variant: CliftVariant,
+    num_latents: Option<usize>,
+    dim: Option<usize>,
+    num_heads: Option<usize>,
+    feed_forward_dim: Option<usize>,
+    num_encoder_blocks: Option<usize>,
+    num_renderer_blocks: Option<usize>,
+    patch_size: Option<usize>,
+    camera_encoding: CameraEncoding,
+    rays: RayFrame,
+    patch_grids: PatchGrids,
+    condenser: CondenserSection,
 }
 
 /// [`CondenserConfig`] in a file.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(crate) struct CondenserSection {
-    pub num_blocks: Option<usize>,
-    pub residual: Option<bool>,
-    pub member_share: bool,
+struct CondenserSection {
+    num_blocks: Option<usize>,
+    residual: Option<bool>,
+    member_share: bool,
+}
+
+impl From<ModelSection> for ModelConfig {
+    fn from(section: ModelSection) -> Self {
+        let ModelSection { architecture, variant, .. } = section;
+        let defaults = match architecture {
+            Architecture::Clift => Self { condenser: CondenserConfig::of(variant), ..SIZES },
+            Architecture::LvsmEd => Self { num_heads: 12, feed_forward_dim: 3072, num_latents: 3072, ..SIZES },
+        };
+        Self {
+            architecture,
+            variant,
+            num_latents: section.num_latents.unwrap_or(defaults.num_latents),
+            dim: section.dim.unwrap_or(defaults.dim),
+            num_heads: section.num_heads.unwrap_or(defaults.num_heads),
+            feed_forward_dim: section.feed_forward_dim.unwrap_or(defaults.feed_forward_dim),
+            num_encoder_blocks: section.num_encoder_blocks.unwrap_or(defaults.num_encoder_blocks),
+            num_renderer_blocks: section.num_renderer_blocks.unwrap_or(defaults.num_renderer_blocks),
+            patch_size: section.patch_size.unwrap_or(defaults.patch_size),
+            camera_encoding: section.camera_encoding,
+            rays: section.rays,
+            patch_grids: section.patch_grids,
+            condenser: CondenserConfig {
+                num_blocks: section.condenser.num_blocks.unwrap_or(defaults.condenser.num_blocks),
+                residual: section.condenser.residual.unwrap_or(defaults.condenser.residual),
+                member_share: section.condenser.member_share,
+            },
+        }
+    }
 }
 
 impl ModelConfig {
+    /// Whether linear layers and layer norms have biases. Without them, matrices are normal at the start.
+    pub(crate) fn has_biases(&self) -> bool {
+        self.architecture != Architecture::LvsmEd
+    }
+
+    /// Whether the heads of queries and keys in encoder and renderer have norms.
+    pub(crate) fn has_query_key_norms(&self) -> bool {
+        self.architecture == Architecture::LvsmEd || self.variant.has_norms()
+    }
+
+    /// Whether the encoder's tokens have a norm.
+    pub fn has_token_norm(&self) -> bool {
+        self.variant.has_norms()
+    }
+
+    /// Returns the number of encoder tokens of `num_views` context views.
+    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+        let num_patches = self.num_patches(num_views, height, width)?;
+        Ok(self.num_learned_tokens().unwrap_or(num_patches))
+    }
+
+    /// Returns the number of tokens of a scene that are learned and belong to no view; `None` for a token per patch.
+    pub fn num_learned_tokens(&self) -> Option<usize> {
+        (self.architecture == Architecture::LvsmEd).then_some(self.num_latents)
+    }
+
+    /// Whether every token belongs to a patch of a context view: a scene file stores its place, and a view can select the
+    /// tokens nearest to its camera.
+    pub fn has_patch_tokens(&self) -> bool {
+        self.num_learned_tokens().is_none()
+    }
+
     /// Returns the values of one context patch: RGB and the coordinates of the ray per pixel (576 for 8 x 8 in the world
     /// frame).
     pub fn context_patch_len(&self) -> usize {
@@ -142,9 +199,6 @@ impl ModelConfig {
     }
 
     /// Returns the number of patches of `num_views` views of `width` by `height` pixels.
-    ///
-    /// # Errors
-    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn num_patches(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
         let patch_size = self.patch_size;
         if height == 0 || width == 0 || !height.is_multiple_of(patch_size) || !width.is_multiple_of(patch_size) {
@@ -153,36 +207,15 @@ impl ModelConfig {
         Ok(num_views * (height / patch_size) * (width / patch_size))
     }
 
-    /// Returns the number of groups of context views that the encoder reads one by one: the fewest equal groups of at most
-    /// `group_size` views. Views that do not divide so are one group.
-    pub fn num_groups(&self, num_views: usize) -> usize {
-        let is_small = |groups: &usize| num_views.is_multiple_of(*groups) && num_views / groups <= self.group_size;
-        (1..=num_views / 2).find(is_small).unwrap_or(1)
-    }
-
-    /// Whether a view can be rendered from the tokens of several groups: rays of cameras depend on no frame, so that all groups
-    /// share one.
-    pub fn joins_groups(&self) -> bool {
-        self.rays == RayFrame::Camera
-    }
-
     /// Returns the number of patches of every grid that an image of `width` by `height` pixels is the mean of.
-    ///
-    /// # Errors
-    /// As [`num_patches`](Self::num_patches).
     pub(crate) fn drawn_patches(&self, height: usize, width: usize) -> Result<Vec<usize>, ModelError> {
         self.num_patches(1, height, width)?;
         let patches = self.patch_grids.patches(self.patch_size, [height, width].map(|side| side / self.patch_size));
         Ok(patches.map(|[rows, columns]| rows * columns).collect())
     }
 
-    /// Whether the encoder's tokens have a norm.
-    pub fn has_token_norm(&self) -> bool {
-        self.variant.has_norms()
-    }
-
-    /// Checks the values that all architectures have.
-    pub(crate) fn validate_sizes(&self) -> Result<(), ModelError> {
+    /// Checks every value against its range.
+    pub fn validate(&self) -> Result<(), ModelError> {
         check_count("model.dim", self.dim, 1 << 16)?;
         check_count("model.num_heads", self.num_heads, 1 << 10)?;
         check_count("model.feed_forward_dim", self.feed_forward_dim, 1 << 18)?;
@@ -193,11 +226,58 @@ impl ModelConfig {
             let fix = format!("write a divisor of model.dim = {dim}, such as {}", near_divisors(dim, num_heads));
             return bad("model.num_heads", num_heads, fix);
         }
+        check_count("model.num_encoder_blocks", self.num_encoder_blocks, 1 << 10)?;
+        match self.architecture {
+            Architecture::Clift => self.validate_clift()?,
+            Architecture::LvsmEd => self.validate_lvsm_ed()?,
+        }
+        self.validate_cameras()
+    }
+
+    fn validate_clift(&self) -> Result<(), ModelError> {
+        let variant = self.variant;
+        self.check_absent("model.num_latents", self.num_latents)?;
+        check_count("model.condenser.num_blocks", self.condenser.num_blocks, 64)?;
+        if !variant.is_released() {
+            return Ok(());
+        }
+        let CondenserConfig { num_blocks, residual, member_share } = self.condenser;
+        if self.camera_encoding != CameraEncoding::Plucker {
+            let fix = format!("model.variant = \"{variant}\" has \"plucker\": leave the key out");
+            return bad("model.camera_encoding", self.camera_encoding, fix);
+        }
+        if num_blocks != 1 {
+            let fix = format!("model.variant = \"{variant}\" has one: leave the key out");
+            return bad("model.condenser.num_blocks", num_blocks, fix);
+        }
+        if !residual {
+            let fix = format!("the block of model.variant = \"{variant}\" has residuals: leave the key out");
+            return bad("model.condenser.residual", residual, fix);
+        }
+        if member_share {
+            let fix = format!("the block of model.variant = \"{variant}\" adds the whole update: leave the key out");
+            return bad("model.condenser.member_share", member_share, fix);
+        }
         Ok(())
     }
 
-    /// Checks camera-relative attention and patch grids.
-    pub(crate) fn validate_cameras(&self) -> Result<(), ModelError> {
+    fn validate_lvsm_ed(&self) -> Result<(), ModelError> {
+        check_count("model.num_latents", self.num_latents, 1 << 16)?;
+        self.check_absent("model.condenser.num_blocks", self.condenser.num_blocks)?;
+        let own = |value| format!("model.architecture = \"{}\" has \"{value}\": leave the key out", self.architecture);
+        if self.camera_encoding != CameraEncoding::Plucker {
+            return bad("model.camera_encoding", self.camera_encoding, own("plucker"));
+        }
+        if self.variant == CliftVariant::Paper { Ok(()) } else { bad("model.variant", self.variant, own("paper")) }
+    }
+
+    /// Checks that a count of what the architecture lacks is 0.
+    fn check_absent(&self, key: &'static str, value: usize) -> Result<(), ModelError> {
+        let fix = || format!("model.architecture = \"{}\" has none: leave the key out", self.architecture);
+        if value > 0 { bad(key, value, fix()) } else { Ok(()) }
+    }
+
+    fn validate_cameras(&self) -> Result<(), ModelError> {
         let head_width = self.dim / self.num_heads;
         if self.camera_encoding != CameraEncoding::Plucker && !head_width.is_multiple_of(8) {
             let fix = format!("needs heads of a multiple of 8 channels, not {head_width}: change model.num_heads");
@@ -207,40 +287,25 @@ impl ModelConfig {
             let fix = "needs camera-relative attention: write model.camera_encoding = \"gta\"".into();
             return bad("model.rays", self.rays, fix);
         }
-        if self.patch_grids != PatchGrids::One {
-            let reason = match (self.camera_encoding, self.patch_size) {
-                (CameraEncoding::Prope, _) => Some(
-                    "model.camera_encoding = \"prope\" measures in units of the image size, which other grids change",
-                ),
-                (_, 1) => Some("patches of one pixel have no halves"),
-                _ => None,
-            };
-            if let Some(reason) = reason {
-                return bad("model.patch_grids", usize::from(self.patch_grids), format!("{reason}: write 1"));
-            }
+        if self.patch_grids != PatchGrids::One && self.patch_size == 1 {
+            let fix = "patches of one pixel have no halves: write 1".into();
+            return bad("model.patch_grids", usize::from(self.patch_grids), fix);
         }
         Ok(())
     }
 }
 
-/// Returns the error of a key.
-pub(crate) fn bad(key: &'static str, value: impl Display, fix: String) -> Result<(), ModelError> {
+fn bad(key: &'static str, value: impl Display, fix: String) -> Result<(), ModelError> {
     Err(ModelError::BadConfig { key, value: value.to_string(), fix })
 }
 
 /// Checks that a count is at least 1 and at most `most`.
-pub(crate) fn check_count(key: &'static str, value: usize, most: usize) -> Result<(), ModelError> {
+fn check_count(key: &'static str, value: usize, most: usize) -> Result<(), ModelError> {
     match value {
         0 => bad(key, value, "write at least 1".into()),
         _ if value > most => bad(key, value, format!("write at most {most}")),
         _ => Ok(()),
     }
-}
-
-/// Checks that a count of what the architecture lacks is 0.
-pub(crate) fn check_absent(key: &'static str, value: usize, config: &ModelConfig) -> Result<(), ModelError> {
-    let fix = || format!("model.architecture = \"{}\" has none: leave the key out", config.architecture);
-    if value > 0 { bad(key, value, fix()) } else { Ok(()) }
 }
 
 /// Returns the divisors of `number` next to `wrong` as text.
@@ -256,111 +321,80 @@ fn near_divisors(number: usize, wrong: usize) -> String {
 mod tests {
     use super::*;
 
+    fn parse(text: &str) -> ModelConfig {
+        serde_json::from_str(text).expect("a model section")
+    }
+
     #[test]
-    fn the_variant_sets_the_condenser_and_contradictions_are_errors() {
-        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
+    fn variant_and_architecture_set_the_sizes() {
+        assert_eq!(parse("{}"), ModelConfig::default());
         for variant in CliftVariant::ALL {
             let config = parse(&format!("{{\"variant\": \"{variant}\"}}"));
-            assert_eq!(
-                (config.variant, config.condenser.num_blocks),
-                (variant, if variant.is_released() { 1 } else { 2 })
-            );
+            let num_blocks = if variant.is_released() { 1 } else { 2 };
+            assert_eq!((config.variant, config.condenser.num_blocks), (variant, num_blocks));
             config.validate().expect("the variant alone is valid");
             assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
         }
-        assert_eq!(parse("{}"), ModelConfig::default());
-        let message = |text: &str| parse(text).validate().unwrap_err().to_string();
-        let two = message(r#"{"variant": "released-re10k", "condenser": {"num_blocks": 2}}"#);
-        assert!(
-            two.starts_with("`model.condenser.num_blocks` = 2: model.variant = \"released-re10k\" has one"),
-            "{two}"
-        );
-        let plain = message(r#"{"variant": "released-dl3dv", "condenser": {"residual": false}}"#);
-        assert!(plain.starts_with("`model.condenser.residual` = false"), "{plain}");
-        let shared = message(r#"{"variant": "released-re10k", "condenser": {"member_share": true}}"#);
-        assert!(shared.starts_with("`model.condenser.member_share` = true"), "{shared}");
-        assert!(serde_json::from_str::<ModelConfig>(r#"{"depth": 1}"#).is_err());
-        assert!(serde_json::from_str::<ModelConfig>(r#"{"condenser": {"depth": 1}}"#).is_err());
-    }
-
-    #[test]
-    fn heads_that_do_not_divide_the_width_are_an_error() {
-        let message = ModelConfig { num_heads: 7, ..ModelConfig::default() }.validate().unwrap_err().to_string();
-        assert_eq!(message, "`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8");
-        let message = ModelConfig { num_heads: 800, ..ModelConfig::default() }.validate().unwrap_err().to_string();
-        assert!(message.ends_with("such as 768"), "{message}");
-    }
-
-    #[test]
-    fn lvsm_has_its_own_sizes_and_no_condenser() {
-        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
-        for (variant, sizes) in [("paper", [768, 12, 3072, 3072]), ("released-re10k", [512, 8, 2048, 3072])] {
-            let config = parse(&format!(r#"{{"architecture": "lvsm-ed", "variant": "{variant}"}}"#));
-            config.validate().expect("valid");
-            assert_eq!([config.dim, config.num_heads, config.feed_forward_dim, config.num_latents], sizes);
-            assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 3072);
-            assert_eq!(config.num_patches(4, 256, 256).expect("divides"), 4096);
-            assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
-        }
-        let message = |text: &str| parse(text).validate().unwrap_err().to_string();
-        let cases = [
-            (r#"{"num_latents": 5}"#, "`model.num_latents` = 5: model.architecture = \"clift\" has none"),
-            (r#"{"architecture": "lvsm-ed", "num_latents": 0}"#, "`model.num_latents` = 0: write at least 1"),
-            (
-                r#"{"architecture": "lvsm-ed", "condenser": {"num_blocks": 2}}"#,
-                "`model.condenser.num_blocks` = 2: model.architecture = \"lvsm-ed\" has none",
-            ),
-            (
-                r#"{"architecture": "lvsm-ed", "variant": "released-dl3dv"}"#,
-                "`model.variant` = released-dl3dv: of LVSM, write \"paper\"",
-            ),
-            (
-                r#"{"architecture": "lvsm-ed", "camera_encoding": "gta"}"#,
-                "`model.camera_encoding` = gta: model.architecture = \"lvsm-ed\" has \"plucker\"",
-            ),
-        ];
-        for (text, expected) in cases {
-            assert!(message(text).starts_with(expected), "{}", message(text));
-        }
-    }
-
-    #[test]
-    fn images_are_drawn_on_one_two_or_four_patch_grids() {
-        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text);
-        let gta = r#"{"camera_encoding": "gta", "patch_grids": 4}"#;
-        let config = parse(gta).expect("a model section");
+        let config = parse(r#"{"architecture": "lvsm-ed"}"#);
         config.validate().expect("valid");
-        assert_eq!(config.drawn_patches(16, 24).expect("divides"), [6, 12, 12, 12]);
-        let prope = parse(&gta.replace("gta", "prope")).expect("a model section").validate().unwrap_err().to_string();
-        assert!(prope.starts_with("`model.patch_grids` = 4: model.camera_encoding = \"prope\""), "{prope}");
-        let three = parse(&gta.replace('4', "3")).unwrap_err().to_string();
-        assert!(three.contains("write 1, 2 or 4"), "{three}");
+        let sizes = [config.dim, config.num_heads, config.feed_forward_dim, config.num_latents];
+        assert_eq!(sizes, [768, 12, 3072, 3072]);
+        assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 3072);
+        assert_eq!(config.num_patches(4, 256, 256).expect("divides"), 4096);
+        assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
+        for text in [r#"{"depth": 1}"#, r#"{"condenser": {"depth": 1}}"#, r#"{"patch_grids": 3}"#] {
+            assert!(serde_json::from_str::<ModelConfig>(text).is_err(), "{text}");
+        }
     }
 
     #[test]
-    fn many_views_are_encoded_in_the_fewest_equal_groups() {
-        let groups = |group_size, counts: &[usize]| {
-            let config = ModelConfig { group_size, ..ModelConfig::default() };
-            counts.iter().map(|&views| config.num_groups(views)).collect::<Vec<_>>()
+    fn contradictions_are_errors_with_key_and_remedy() {
+        let cases = [
+            (r#""num_heads": 7"#, "num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8"),
+            (r#""num_heads": 800"#, "num_heads` = 800: write a divisor of model.dim = 768, such as 768"),
+            (r#""num_latents": 5"#, r#"num_latents` = 5: model.architecture = "clift" has none"#),
+            (r#""patch_size": 1, "patch_grids": 4"#, "patch_grids` = 4: patches of one pixel have no halves: write 1"),
+            (r#""rays": "camera""#, "rays` = camera: needs camera-relative attention"),
+        ];
+        let released = [
+            (r#""num_blocks": 2"#, r#"num_blocks` = 2: model.variant = "released-re10k" has one"#),
+            (r#""residual": false"#, "residual` = false: the block of"),
+            (r#""member_share": true"#, "member_share` = true: the block of"),
+        ];
+        let lvsm = [
+            (r#""num_latents": 0"#, "num_latents` = 0: write at least 1"),
+            (
+                r#""condenser": {"num_blocks": 2}"#,
+                r#"condenser.num_blocks` = 2: model.architecture = "lvsm-ed" has none"#,
+            ),
+            (
+                r#""variant": "released-re10k""#,
+                r#"variant` = released-re10k: model.architecture = "lvsm-ed" has "paper""#,
+            ),
+            (r#""camera_encoding": "gta""#, r#"camera_encoding` = gta: model.architecture = "lvsm-ed" has "plucker""#),
+        ];
+        let check = |text: &str, expected: &str| {
+            let message = parse(text).validate().unwrap_err().to_string();
+            assert!(message.starts_with(expected), "{message}");
         };
-        assert_eq!(groups(0, &[0, 1, 4, 100]), [1; 4]);
-        assert_eq!(groups(4, &[1, 2, 4, 6, 8, 9, 10, 12]), [1, 1, 1, 2, 2, 3, 5, 3]);
-        assert_eq!(groups(4, &[5, 7, 11]), [1; 3], "a prime number is one group");
+        for (text, expected) in cases {
+            check(&format!("{{{text}}}"), &format!("`model.{expected}"));
+        }
+        for (text, expected) in released {
+            let text = format!(r#"{{"variant": "released-re10k", "condenser": {{{text}}}}}"#);
+            check(&text, &format!("`model.condenser.{expected}"));
+        }
+        for (text, expected) in lvsm {
+            check(&format!(r#"{{"architecture": "lvsm-ed", {text}}}"#), &format!("`model.{expected}"));
+        }
     }
 
     #[test]
-    fn rays_of_cameras_need_camera_relative_attention() {
-        let message = |text: &str| {
-            let config = serde_json::from_str::<ModelConfig>(text).expect("a model section");
-            config.validate().map(|()| config.context_patch_len()).map_err(|error| error.to_string())
-        };
-        let plucker = message(r#"{"rays": "camera"}"#).unwrap_err();
-        assert!(plucker.starts_with("`model.rays` = camera: needs camera-relative attention"), "{plucker}");
-        assert_eq!(message(r#"{"rays": "camera", "camera_encoding": "gta", "patch_size": 4}"#), Ok(96));
-    }
-
-    #[test]
-    fn an_image_of_partial_patches_is_an_error() {
+    fn patches_of_images_are_counted() {
+        let config = parse(r#"{"camera_encoding": "gta", "patch_grids": 4, "rays": "camera", "patch_size": 4}"#);
+        config.validate().expect("valid");
+        assert_eq!(config.context_patch_len(), 96);
+        assert_eq!(parse(r#"{"patch_grids": 4}"#).drawn_patches(16, 24).expect("divides"), [6, 12, 12, 12]);
         let error = ModelConfig::default().num_patches(1, 250, 256).unwrap_err();
         assert_eq!(error.to_string(), "an image of 256 x 250 does not divide into patches of 8 x 8");
         assert!(ModelConfig::default().num_tokens(1, 0, 256).is_err());

@@ -10,26 +10,13 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The parameters that the layers of a network have.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct LayerStyle {
-    /// Whether linear layers and layer norms have biases. Without them, matrices are normal.
-    pub has_biases: bool,
-    /// Whether the heads of queries and keys have norms.
-    pub has_query_key_norms: bool,
-}
-
-impl LayerStyle {
-    /// PyTorch's transformer layers.
-    pub const PYTORCH: Self = Self { has_biases: true, has_query_key_norms: false };
-}
+use crate::network::config::ModelConfig;
 
 /// A source of initialized layers on a device. All layers share one stream of random numbers.
 #[derive(Debug)]
 pub struct Init {
     device: Device,
     rng: ChaCha8Rng,
-    style: LayerStyle,
     /// Standard deviation of LVSM's matrices, whose layers have no bias; `None` for PyTorch's distributions.
     deviation: Option<f64>,
 }
@@ -40,26 +27,12 @@ const DEVIATION: f64 = 0.02;
 impl Init {
     /// Starts the stream of `seed` for layers with biases.
     pub fn new(seed: u64, device: &Device) -> Self {
-        Self::with_style(LayerStyle::PYTORCH, seed, device)
+        Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed), deviation: None }
     }
 
-    /// Starts the stream of `seed` for layers of a style.
-    pub(crate) fn with_style(style: LayerStyle, seed: u64, device: &Device) -> Self {
-        let deviation = (!style.has_biases).then_some(DEVIATION);
-        Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed), style, deviation }
-    }
-
-    /// Makes layers without norms of queries and keys.
-    pub(crate) fn without_query_key_norms<T>(&mut self, make: impl FnOnce(&mut Self) -> T) -> T {
-        let former = std::mem::replace(&mut self.style.has_query_key_norms, false);
-        let layers = make(self);
-        self.style.has_query_key_norms = former;
-        layers
-    }
-
-    /// Whether the heads of queries and keys have norms.
-    pub(crate) fn has_query_key_norms(&self) -> bool {
-        self.style.has_query_key_norms
+    /// Starts the stream of `seed` for the layers of a network.
+    pub fn of(config: &ModelConfig, seed: u64, device: &Device) -> Self {
+        Self { deviation: (!config.has_biases()).then_some(DEVIATION), ..Self::new(seed, device) }
     }
 
     /// Starts a transformer block by its index, or the layers outside the blocks: LVSM's matrices get smaller with depth.
@@ -98,22 +71,15 @@ impl Init {
         self.matrix(dim, dim, 1.0 / (dim as f64).sqrt())
     }
 
-    /// Makes a linear layer of zeros without bias (`W_z` of equation 4).
-    pub fn zero_linear(&mut self, inputs: usize, outputs: usize) -> Linear {
-        Linear { weight: self.zeros([inputs, outputs]), bias: None }
+    /// Makes a linear layer of zeros: `W_z` of equation 4, or the gate of the released condensers, which has a bias.
+    pub fn zero_linear(&mut self, dim: usize, has_bias: bool) -> Linear {
+        Linear { weight: self.zeros([dim, dim]), bias: has_bias.then(|| self.zeros([dim])) }
     }
 
-    /// Makes a linear layer of zeros with bias: the gate of the released condensers.
-    pub fn zero_linear_with_bias(&mut self, inputs: usize, outputs: usize) -> Linear {
-        Linear { bias: Some(self.zeros([outputs])), ..self.zero_linear(inputs, outputs) }
-    }
-
-    /// Makes an RMS norm with epsilon 1e-5.
     pub fn rms_norm(&mut self, dim: usize) -> RmsNorm {
         RmsNormConfig::new(dim).init(&self.device)
     }
 
-    /// Makes a layer norm with epsilon 1e-5.
     pub fn layer_norm(&mut self, dim: usize) -> LayerNorm {
         LayerNormConfig::new(dim).with_bias(self.deviation.is_none()).init(&self.device)
     }
@@ -148,7 +114,6 @@ impl Init {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::network::architecture::CliftVariant;
     use crate::testing::{devices, small_lvsm, to_vec};
 
     #[test]
@@ -162,7 +127,7 @@ mod tests {
     #[test]
     fn weights_of_lvsm_are_normal_and_shrink_with_depth() {
         let deviation = |values: Vec<f64>| (values.iter().map(|x| x * x).sum::<f64>() / values.len() as f64).sqrt();
-        let mut init = Init::of(&small_lvsm(CliftVariant::Paper), 0, &Device::flex());
+        let mut init = Init::of(&small_lvsm(), 0, &Device::flex());
         let mut of_block = |index| init.block(index).linear(100, 400);
         assert!(of_block(None).bias.is_none());
         for (index, expected) in [(None, 0.02), (Some(0), 0.02 / 2.0_f64.sqrt()), (Some(7), 0.005)] {
@@ -173,20 +138,5 @@ mod tests {
         assert!(latents.iter().all(|value| value.abs() <= 0.04));
         // A normal distribution cut at two deviations has 0.88 of its deviation.
         assert!((deviation(latents) / (0.88 * 0.02) - 1.0).abs() < 0.02);
-        let stock = Init::of(&small_lvsm(CliftVariant::ReleasedRe10k), 0, &Device::flex()).linear(4, 4);
-        assert!(stock.bias.is_some(), "PyTorch's layers");
-    }
-
-    #[test]
-    fn weights_fill_their_interval() {
-        let device = Device::flex();
-        let mut init = Init::new(0, &device);
-        let spread = |values: Vec<f64>| values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
-        let bound = 1.0 / 64.0_f64.sqrt();
-        let largest = spread(to_vec(init.linear(64, 64).weight.val()));
-        assert!(largest <= bound && largest > 0.99 * bound, "{largest}");
-        let bound = (6.0 / 256.0_f64).sqrt();
-        let largest = spread(to_vec(init.attention_in(64, 3).weight.val()));
-        assert!(largest <= bound && largest > 0.99 * bound, "{largest}");
     }
 }

@@ -1,24 +1,19 @@
 //! The one description of the networks: every layer with its path, its sizes and the rows of its input.
 //!
-//! Parameter names and counts, multiply-accumulates, memory, largest tensors and published names are derived from this
-//! list. An architecture lists its layers in `Design::layers`.
+//! Parameter names and counts, multiply-accumulates, memory and published names are derived from this list.
 
+use crate::network::architecture::Architecture;
 use crate::network::blocks::feed_forward::Activation;
 use crate::network::config::ModelConfig;
-use crate::network::init::LayerStyle;
 
-/// A layer of a network.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Layer {
     /// Path of its module, such as `encoder.blocks.0.attn.in_proj`.
     pub path: String,
-    /// The network of the layer.
     pub part: Part,
     /// Index of its transformer block; `None` outside the blocks.
     pub block: Option<usize>,
-    /// Operation and width.
     pub kind: LayerKind,
-    /// Rows of the input.
     pub rows: Sequence,
     /// Whether the layer saves its input for the backward. A linear layer after a norm or an activation recomputes its
     /// input; layers that project a scene's tokens share one copy of them.
@@ -63,20 +58,41 @@ pub type Sequence = &'static [Rows];
 /// Operation of a layer with its width: of all heads together, except in [`LayerKind::HeadNorm`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LayerKind {
-    /// Matrix product.
-    Linear { inputs: usize, outputs: usize, bias: bool },
-    /// Layer norm with scale and, with `bias`, shift.
-    LayerNorm { width: usize, bias: bool },
+    Linear {
+        inputs: usize,
+        outputs: usize,
+        bias: bool,
+    },
+    LayerNorm {
+        width: usize,
+        bias: bool,
+    },
     /// RMS norm of every head of queries or keys; the heads share one scale.
-    HeadNorm { width: usize, heads: usize },
+    HeadNorm {
+        width: usize,
+        heads: usize,
+    },
     /// Softmax attention of every row to all keys of its group.
-    Attention { width: usize, heads: usize, keys: Sequence },
+    Attention {
+        width: usize,
+        heads: usize,
+        keys: Sequence,
+    },
     /// Softmax attention of every centroid to the keys of its cluster; each key belongs to one centroid.
-    ClusterAttention { width: usize, keys: Sequence },
+    ClusterAttention {
+        width: usize,
+        keys: Sequence,
+    },
     /// Activation between the layers of a feed-forward network.
-    Activation { width: usize, activation: Activation },
+    Activation {
+        width: usize,
+        activation: Activation,
+    },
     /// Learned rows, beside the layer's input.
-    Table { rows: usize, width: usize },
+    Table {
+        rows: usize,
+        width: usize,
+    },
 }
 
 impl Layer {
@@ -94,64 +110,139 @@ impl Layer {
         paths.into_iter().zip(shapes).collect()
     }
 
-    /// Returns the number of parameters.
     pub fn num_parameters(&self) -> u64 {
         self.parameters().iter().map(|(_, shape)| shape.iter().product::<usize>() as u64).sum()
     }
 }
 
 // Sequences of the architectures' layers
-pub(crate) const CONTEXT: Sequence = &[Rows::ContextPatches];
-pub(crate) const MEMBERS: Sequence = &[Rows::Members];
-pub(crate) const STORED: Sequence = &[Rows::StoredTokens];
-pub(crate) const GATHERING: Sequence = &[Rows::GatheringTokens];
+const CONTEXT: Sequence = &[Rows::ContextPatches];
+const MEMBERS: Sequence = &[Rows::Members];
+const STORED: Sequence = &[Rows::StoredTokens];
+const GATHERING: Sequence = &[Rows::GatheringTokens];
 pub(crate) const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
-pub(crate) const TARGETS: Sequence = &[Rows::TargetPatches];
-pub(crate) const LATENTS: Sequence = &[Rows::Latents];
-pub(crate) const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
+const TARGETS: Sequence = &[Rows::TargetPatches];
+const LATENTS: Sequence = &[Rows::Latents];
+const LATENTS_AND_CONTEXT: Sequence = &[Rows::Latents, Rows::ContextPatches];
 pub(crate) const TARGETS_AND_TOKENS: Sequence = &[Rows::TargetPatches, Rows::RenderTokens];
 
+impl ModelConfig {
+    /// Lists every layer in the order of published checkpoints: encoder, token norm, renderer, condenser; within a block
+    /// attention, feed-forward network, norms.
+    pub(crate) fn layers(&self) -> Vec<Layer> {
+        let (path, layers) = (String::new(), Vec::new());
+        let mut list = LayerList { config: self, path, part: Part::Encoder, block: None, layers };
+        list.encoder();
+        list.renderer();
+        list.condenser();
+        list.layers
+    }
+}
+
 /// The layers listed so far, and the network, block and path of the next ones.
-pub(crate) struct LayerList<'a> {
+struct LayerList<'a> {
     config: &'a ModelConfig,
-    /// The parameters of the next layers.
-    pub style: LayerStyle,
-    /// The activation of the next feed-forward networks.
-    pub activation: Activation,
     path: String,
     part: Part,
     block: Option<usize>,
-    pub layers: Vec<Layer>,
+    layers: Vec<Layer>,
 }
 
-impl<'a> LayerList<'a> {
-    pub fn new(config: &'a ModelConfig, style: LayerStyle) -> Self {
-        let activation = Activation::Gelu;
-        Self { config, style, activation, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() }
+impl LayerList<'_> {
+    fn encoder(&mut self) {
+        let (config, is_lvsm) = (self.config, self.is_lvsm());
+        self.enter(Part::Encoder, None, "encoder");
+        self.linear("patch_embed", [config.context_patch_len(), config.dim], CONTEXT, true);
+        if is_lvsm {
+            let latents = LayerKind::Table { rows: config.num_latents, width: config.dim };
+            self.push("latents", latents, LATENTS_AND_CONTEXT, false);
+        }
+        let rows = if is_lvsm { LATENTS_AND_CONTEXT } else { CONTEXT };
+        for i in 0..config.num_encoder_blocks {
+            self.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
+            // The last block of LVSM's networks computes the rows that are read after it.
+            let is_last = i + 1 == config.num_encoder_blocks;
+            self.encoder_block(rows, if is_lvsm && is_last { LATENTS } else { rows });
+        }
+        if config.has_token_norm() {
+            self.enter(Part::TokenNorm, None, "lift_norm");
+            self.norm("norm", CONTEXT);
+        }
+    }
+
+    fn renderer(&mut self) {
+        let config = self.config;
+        self.enter(Part::Renderer, None, "renderer");
+        self.linear("ray_embed", [config.ray_patch_len(), config.dim], TARGETS, true);
+        if self.is_lvsm() {
+            self.norm("joint.input_norm", TARGETS_AND_TOKENS);
+        }
+        for i in 0..config.num_renderer_blocks {
+            if self.is_lvsm() {
+                self.enter(Part::Renderer, Some(i), &format!("renderer.joint.blocks.{i}"));
+                let is_last = i + 1 == config.num_renderer_blocks;
+                self.encoder_block(TARGETS_AND_TOKENS, if is_last { TARGETS } else { TARGETS_AND_TOKENS });
+            } else {
+                self.enter(Part::Renderer, Some(i), &format!("renderer.blocks.{i}"));
+                self.decoder_block(TARGETS, RENDER_TOKENS);
+            }
+        }
+        self.enter(Part::Renderer, None, "renderer");
+        self.norm("output_norm", TARGETS);
+        self.linear("to_pixels", [config.dim, config.rgb_patch_len()], TARGETS, false);
+    }
+
+    fn condenser(&mut self) {
+        let ModelConfig { dim, variant, condenser, .. } = self.config;
+        let dim = *dim;
+        if variant.is_released() {
+            self.enter(Part::Condenser, Some(0), "condenser.released");
+            self.decoder_block(STORED, CONTEXT);
+            self.linear("gate", [dim; 2], STORED, true);
+            return;
+        }
+        for i in 0..condenser.num_blocks {
+            self.enter(Part::Condenser, Some(i), &format!("condenser.blocks.{i}"));
+            self.self_attention("self_attn", STORED, STORED);
+            self.norm("norm_self", STORED);
+            if condenser.residual {
+                self.norm("norm_cross", GATHERING);
+            }
+            // All blocks share one copy of the members.
+            self.push("norm_memory", LayerKind::LayerNorm { width: dim, bias: true }, MEMBERS, false);
+            self.norm("norm_ff", STORED);
+            self.cross_attention(GATHERING, !condenser.residual, MEMBERS);
+            self.feed_forward(STORED);
+            self.push("gate", LayerKind::Linear { inputs: dim, outputs: dim, bias: false }, STORED, true);
+        }
+    }
+
+    fn is_lvsm(&self) -> bool {
+        self.config.architecture == Architecture::LvsmEd
     }
 
     /// Starts the layers below a path, of a block or outside the blocks.
-    pub fn enter(&mut self, part: Part, block: Option<usize>, path: &str) {
+    fn enter(&mut self, part: Part, block: Option<usize>, path: &str) {
         (self.part, self.block, self.path) = (part, block, path.to_owned());
     }
 
-    pub fn push(&mut self, name: &str, kind: LayerKind, rows: Sequence, saves_input: bool) {
+    fn push(&mut self, name: &str, kind: LayerKind, rows: Sequence, saves_input: bool) {
         let path = format!("{}.{name}", self.path);
         self.layers.push(Layer { path, part: self.part, block: self.block, kind, rows, saves_input });
     }
 
-    pub fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
-        let bias = self.style.has_biases;
+    fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
+        let bias = self.config.has_biases();
         self.push(name, LayerKind::Linear { inputs, outputs, bias }, rows, saves_input);
     }
 
-    pub fn norm(&mut self, name: &str, rows: Sequence) {
-        let bias = self.style.has_biases;
+    fn norm(&mut self, name: &str, rows: Sequence) {
+        let bias = self.config.has_biases();
         self.push(name, LayerKind::LayerNorm { width: self.config.dim, bias }, rows, true);
     }
 
     /// Adds self-attention of the first rows, `queries`, to all after a norm, with one packed projection.
-    pub fn self_attention(&mut self, name: &str, rows: Sequence, queries: Sequence) {
+    fn self_attention(&mut self, name: &str, rows: Sequence, queries: Sequence) {
         let ModelConfig { dim, num_heads, .. } = *self.config;
         self.linear(&format!("{name}.in_proj"), [dim, 3 * dim], rows, false);
         self.push(name, LayerKind::Attention { width: dim, heads: num_heads, keys: rows }, queries, true);
@@ -159,7 +250,7 @@ impl<'a> LayerList<'a> {
     }
 
     /// Adds cross-attention: in the condenser to the tokens of a cluster, in the renderer to all.
-    pub fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
+    fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
         let ModelConfig { dim: width, num_heads: heads, .. } = *self.config;
         let (name, kind) = match self.part {
             Part::Condenser => ("cluster_attn", LayerKind::ClusterAttention { width, keys }),
@@ -174,44 +265,37 @@ impl<'a> LayerList<'a> {
     fn attention_output(&mut self, name: &str, rows: Sequence, keys: Sequence) {
         let ModelConfig { dim, num_heads: heads, .. } = *self.config;
         self.linear(&format!("{name}.out_proj"), [dim, dim], rows, true);
-        if self.style.has_query_key_norms && self.part != Part::Condenser {
+        if self.config.has_query_key_norms() && self.part != Part::Condenser {
             let norm = LayerKind::HeadNorm { width: dim / heads, heads };
             self.push(&format!("{name}.qk_norm.query"), norm, rows, true);
             self.push(&format!("{name}.qk_norm.key"), norm, keys, true);
         }
     }
 
-    /// Adds the two layers of a feed-forward network.
-    pub fn feed_forward(&mut self, rows: Sequence) {
+    fn feed_forward(&mut self, rows: Sequence) {
         let ModelConfig { dim, feed_forward_dim: hidden, .. } = *self.config;
         self.linear("feed_forward.up", [dim, hidden], rows, false);
-        self.push("feed_forward", LayerKind::Activation { width: hidden, activation: self.activation }, rows, true);
+        let is_relu = self.part == Part::Condenser && self.config.variant.is_released();
+        let activation = if is_relu { Activation::Relu } else { Activation::Gelu };
+        self.push("feed_forward", LayerKind::Activation { width: hidden, activation }, rows, true);
         self.linear("feed_forward.down", [hidden, dim], rows, false);
     }
 
     /// Adds PyTorch's pre-norm encoder layer, which computes the first rows, `outputs`.
-    pub fn encoder_block(&mut self, rows: Sequence, outputs: Sequence) {
+    fn encoder_block(&mut self, rows: Sequence, outputs: Sequence) {
         self.self_attention("attn", rows, outputs);
         self.feed_forward(outputs);
         self.norm("norm_attn", rows);
         self.norm("norm_ff", outputs);
     }
 
-    /// Adds PyTorch's pre-norm decoder layer.
-    pub fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
+    fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
         self.self_attention("self_attn", rows, rows);
         self.cross_attention(rows, false, keys);
         self.feed_forward(rows);
         for name in ["norm_self", "norm_cross", "norm_ff"] {
             self.norm(name, rows);
         }
-    }
-
-    /// Adds the norm and the projection that decode images at the end of a renderer.
-    pub fn output_head(&mut self) {
-        self.enter(Part::Renderer, None, "renderer");
-        self.norm("output_norm", TARGETS);
-        self.linear("to_pixels", [self.config.dim, self.config.rgb_patch_len()], TARGETS, false);
     }
 }
 

@@ -3,8 +3,7 @@
 use burn::tensor::{Int, Tensor, TensorData};
 
 use crate::network::blocks::block::DecoderBlock;
-use crate::network::camera_encoding::upload_ids;
-use crate::network::tokens::Tokens;
+use crate::network::tokens::{Tokens, select};
 
 /// Input of the renderer's blocks from a scene, the same for all of its views.
 #[derive(Clone, Debug)]
@@ -12,13 +11,8 @@ use crate::network::tokens::Tokens;
 pub enum KeyValueCache {
     /// The tokens themselves.
     Tokens(RenderTokens),
-    /// Keys and values of the tokens.
-    Projected {
-        /// One tensor per block, `[batch, num_tokens, 2 dim]`.
-        blocks: Vec<Tensor<3>>,
-        /// Number of tokens.
-        num_tokens: usize,
-    },
+    /// Keys and values of the tokens, `[batch, num_tokens, 2 dim]` per block.
+    Projected(Vec<Tensor<3>>),
 }
 
 impl KeyValueCache {
@@ -26,18 +20,15 @@ impl KeyValueCache {
     pub fn num_tokens(&self) -> usize {
         match self {
             Self::Tokens(tokens) => tokens.num_tokens(),
-            Self::Projected { num_tokens, .. } => *num_tokens,
+            Self::Projected(blocks) => blocks[0].dims()[1],
         }
     }
 
     /// Returns the tokens of every set, `[groups, num_tokens, dim]`.
-    ///
-    /// # Panics
-    /// For projected tokens.
     pub(crate) fn sets(&self) -> Tensor<3> {
         match self {
             Self::Tokens(tokens) => tokens.sets(),
-            Self::Projected { .. } => panic!("the renderer reads tokens, not their keys and values"),
+            Self::Projected(_) => panic!("the renderer reads tokens, not their keys and values"),
         }
     }
 
@@ -52,10 +43,7 @@ impl KeyValueCache {
                 assert!(rows.is_none(), "one set of tokens per scene");
                 Self::Tokens(tokens.select(ids).into())
             }
-            Self::Projected { blocks, .. } => {
-                let select = |key_value: &Tensor<3>| key_value.clone().select(1, upload_ids(ids, &key_value.device()));
-                Self::Projected { blocks: blocks.iter().map(select).collect(), num_tokens: ids.len() }
-            }
+            Self::Projected(blocks) => Self::Projected(blocks.iter().map(|rows| select(rows.clone(), ids)).collect()),
         }
     }
 }
@@ -78,9 +66,6 @@ impl From<Tokens> for RenderTokens {
 impl RenderTokens {
     /// Selects a subset of the scene's tokens for every target view; all subsets have the same size.
     /// `subsets[scene][view]` are token indices.
-    ///
-    /// # Shapes
-    /// - `tokens`: `[batch, num_tokens, dim]`
     pub fn subsets(tokens: Tokens, subsets: &[Vec<Vec<u32>>]) -> Self {
         let [batch, num_tokens, _dim] = tokens.dims();
         let groups: usize = subsets.iter().map(Vec::len).sum();
@@ -95,19 +80,14 @@ impl RenderTokens {
         let rows = rows.reshape([groups, count / groups]);
         // Keys and values are projected from whichever has fewer rows: the tokens, or all subsets together.
         if count < batch * num_tokens {
-            let transforms = tokens.transforms.as_ref();
-            let transforms = transforms.map(|transforms| transforms.gather(rows.clone().reshape([count]), groups));
-            Tokens { values: gather(tokens.values, rows), transforms }.into()
+            tokens.map(|x| gather(x, rows.clone())).into()
         } else {
             Self { tokens, rows: Some(rows) }
         }
     }
 
-    /// Returns the same sets of tokens with other values, tracked by autodiff if `values` are.
-    #[must_use]
-    pub fn with_values(&self, values: Tensor<3>) -> Self {
-        let rows = self.rows.clone().map(|rows| if values.is_autodiff() { rows.autodiff() } else { rows });
-        Self { tokens: self.tokens.with_values(values), rows }
+    pub(crate) fn num_tokens(&self) -> usize {
+        self.rows.as_ref().map_or(self.tokens.dims()[1], |rows| rows.dims()[1])
     }
 
     /// Returns the values of the tokens that keys and values are projected from.
@@ -115,12 +95,6 @@ impl RenderTokens {
         &self.tokens.values
     }
 
-    /// Returns the number of tokens of every set.
-    pub(crate) fn num_tokens(&self) -> usize {
-        self.rows.as_ref().map_or(self.tokens.dims()[1], |rows| rows.dims()[1])
-    }
-
-    /// Whether the tokens have the transforms of camera-relative attention.
     pub(crate) fn has_transforms(&self) -> bool {
         self.tokens.transforms.is_some()
     }

@@ -3,7 +3,7 @@
 use burn::tensor::{Int, Tensor, TensorData};
 
 use crate::error::ModelError;
-use crate::network::camera_encoding::{TokenTransforms, TransformMaker, upload_ids};
+use crate::network::camera_encoding::transforms;
 use crate::network::config::ModelConfig;
 use crate::tokens::clusters::ClusterIndex;
 use crate::views::upload::Cameras;
@@ -13,27 +13,19 @@ use crate::views::upload::Cameras;
 pub struct Tokens {
     /// Values, `[batch, num_tokens, dim]`.
     pub values: Tensor<3>,
-    /// Transform of every token; `None` without camera-relative attention.
-    pub transforms: Option<TokenTransforms>,
+    /// Transform of every token, `[batch, num_tokens, L]`; `None` without camera-relative attention.
+    pub transforms: Option<Tensor<3>>,
 }
 
 impl Tokens {
     /// Takes the tokens of a network without camera-relative attention.
-    ///
-    /// # Shapes
-    /// - `values`: `[batch, num_tokens, dim]`
     pub fn without_cameras(values: Tensor<3>) -> Self {
         Self { values, transforms: None }
     }
 
     /// Takes stored tokens, one of every patch of the context views in `ids`.
-    ///
-    /// # Shapes
-    /// - `values`: `[batch, num_tokens, dim]`
-    /// - `context`: `[batch, views]`
     pub fn of_patches(config: &ModelConfig, values: Tensor<3>, context: &Cameras, ids: &[u32]) -> Self {
-        let transforms = TransformMaker::new(config).of_views(context);
-        Self { values, transforms: transforms.map(|transforms| transforms.select(ids)) }
+        Self { values, transforms: transforms(config, context).map(|transforms| select(transforms, ids)) }
     }
 
     /// Returns `[batch, num_tokens, dim]`.
@@ -44,26 +36,16 @@ impl Tokens {
     /// Returns other values of the same tokens.
     #[must_use]
     pub fn with_values(&self, values: Tensor<3>) -> Self {
-        Self { transforms: self.transforms.as_ref().map(|transforms| transforms.tracked_as(&values)), values }
+        Self { transforms: self.transforms.as_ref().map(|transforms| tracked_as(transforms, &values)), values }
     }
 
-    /// Joins the groups of every scene.
-    ///
-    /// # Shapes
-    /// - of `[batch * groups, count, dim]`; returns `[batch, groups * count, dim]`
+    /// Returns values and transforms with other rows.
     #[must_use]
-    pub(crate) fn joined(self, batch: usize) -> Self {
-        let [groups, count, dim] = self.dims();
-        Self {
-            transforms: self.transforms.map(|transforms| transforms.regroup(batch)),
-            values: self.values.reshape([batch, groups * count / batch, dim]),
-        }
+    pub(crate) fn map(&self, rows: impl Fn(Tensor<3>) -> Tensor<3>) -> Self {
+        Self { values: rows(self.values.clone()), transforms: self.transforms.clone().map(rows) }
     }
 
     /// Returns the values on the host, row-major.
-    ///
-    /// # Errors
-    /// [`ModelError::Device`].
     pub fn to_host(&self) -> Result<Vec<f32>, ModelError> {
         self.values.clone().into_data().convert::<f32>().try_to_vec().map_err(ModelError::device)
     }
@@ -77,21 +59,29 @@ impl Tokens {
     /// Selects the same tokens of every scene, given by their indices.
     #[must_use]
     pub fn select(&self, ids: &[u32]) -> Self {
-        Self {
-            transforms: self.transforms.as_ref().map(|transforms| transforms.select(ids)),
-            values: self.values.clone().select(1, upload_ids(ids, &self.values.device())),
-        }
+        self.map(|rows| select(rows, ids))
     }
 
     /// Selects the centroids of clusters, `[batch, num_storage_tokens, dim]`.
     #[must_use]
     pub fn centroids(&self, clusters: &ClusterIndex) -> Self {
-        self.gather(clusters, &clusters.centroid)
+        self.map(|rows| clusters.gather(rows, &clusters.centroid))
     }
+}
 
-    /// Selects rows of the tokens of all scenes.
-    pub(crate) fn gather(&self, clusters: &ClusterIndex, rows: &Tensor<1, Int>) -> Self {
-        let gathered = |transforms: &TokenTransforms| transforms.gather(rows.clone(), clusters.batch);
-        Self { transforms: self.transforms.as_ref().map(gathered), values: clusters.gather(self.values.clone(), rows) }
+/// Selects the same rows of every scene, given by their indices.
+pub(crate) fn select(rows: Tensor<3>, ids: &[u32]) -> Tensor<3> {
+    let ids: Vec<i64> = ids.iter().map(|&id| i64::from(id)).collect();
+    let count = ids.len();
+    let ids = Tensor::<1, Int>::from_data(TensorData::new(ids, [count]), &rows.device());
+    rows.select(1, ids)
+}
+
+/// Returns transforms with autodiff if `other` has it, or without.
+pub(crate) fn tracked_as(transforms: &Tensor<3>, other: &Tensor<3>) -> Tensor<3> {
+    match (transforms.is_autodiff(), other.is_autodiff()) {
+        (false, true) => transforms.clone().autodiff(),
+        (true, false) => transforms.clone().inner(),
+        _ => transforms.clone(),
     }
 }

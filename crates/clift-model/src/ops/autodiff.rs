@@ -10,24 +10,24 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend};
 
+/// Gradients of the inputs; those that are not needed may be `None`.
+pub(crate) type InputGrads<B, const N: usize> = [Option<FloatTensor<B>>; N];
+
 /// An operation on `N` float tensors with its gradients. A value of the type has the settings, and tensors without gradient.
 pub(crate) trait Differentiable<B: Backend, const N: usize>: Clone + Debug + Send + 'static {
     /// Tensors that the gradients are computed from.
     type Saved: Clone + Debug + Send + 'static;
 
-    /// Computes the output.
-    fn forward(&self, inputs: [FloatTensor<B>; N]) -> FloatTensor<B>;
+    /// Computes the output. Where saving costs time, without it.
+    fn forward(&self, inputs: [FloatTensor<B>; N]) -> FloatTensor<B> {
+        self.forward_saving(inputs).0
+    }
 
     /// Computes the output, and what the gradients need.
     fn forward_saving(&self, inputs: [FloatTensor<B>; N]) -> (FloatTensor<B>, Self::Saved);
 
-    /// Computes the gradients of the inputs from the gradient of the output. A gradient that is not `needed` may be `None`.
-    fn gradients(
-        &self,
-        saved: Self::Saved,
-        grad_output: FloatTensor<B>,
-        needed: [bool; N],
-    ) -> [Option<FloatTensor<B>>; N];
+    /// Computes the `needed` gradients from the gradient of the output.
+    fn gradients(&self, saved: Self::Saved, grad: FloatTensor<B>, needed: [bool; N]) -> InputGrads<B, N>;
 }
 
 /// Computes the output of an operation under autodiff; saves for the backward only if an input needs a gradient.

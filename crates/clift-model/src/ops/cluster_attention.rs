@@ -7,9 +7,9 @@ use burn::backend::Dispatch;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::{Int, Tensor, assert_shape};
 
-use crate::ops::autodiff::Differentiable;
+use crate::ops::autodiff::{Differentiable, InputGrads};
 use crate::ops::backends::dispatch::operations;
-use crate::ops::composed::cluster_attention::ClusterInputs;
+use crate::ops::composed::cluster_attention::Clusters;
 use crate::ops::kernels::Kernels;
 use crate::ops::mac_counter;
 
@@ -50,105 +50,57 @@ operations! {
     }
 }
 
-/// The segment of every member, and the number of heads.
-#[derive(Clone, Debug)]
-struct Clusters<T> {
-    segment: T,
-    num_heads: usize,
-}
-
-impl<T: Clone> Clusters<T> {
-    fn inputs<B: Kernels<IntTensorPrimitive = T>>(&self, [query, key_value]: [FloatTensor<B>; 2]) -> ClusterInputs<B> {
-        ClusterInputs { query, key_value, segment: self.segment.clone(), num_heads: self.num_heads }
-    }
-}
-
 impl<B: Kernels> Differentiable<B, 2> for Clusters<IntTensor<B>> {
-    type Saved = (ClusterInputs<B>, [FloatTensor<B>; 2]);
-
-    fn forward(&self, inputs: [FloatTensor<B>; 2]) -> FloatTensor<B> {
-        let [output, _weights] = B::cluster_attention_forward(&self.inputs(inputs));
-        output
-    }
+    type Saved = [FloatTensor<B>; 4];
 
     fn forward_saving(&self, inputs: [FloatTensor<B>; 2]) -> (FloatTensor<B>, Self::Saved) {
-        let inputs = self.inputs(inputs);
-        let results = B::cluster_attention_forward(&inputs);
-        (results[0].clone(), (inputs, results))
+        let [query, key_value] = inputs.clone();
+        let [output, weights] = B::cluster_attention_forward(inputs, self.clone());
+        (output.clone(), [query, key_value, output, weights])
     }
 
     fn gradients(
         &self,
-        (inputs, results): Self::Saved,
-        grad_output: FloatTensor<B>,
-        _needed: [bool; 2],
-    ) -> [Option<FloatTensor<B>>; 2] {
-        B::cluster_attention_backward(inputs, results, grad_output).map(Some)
+        [query, key_value, output, weights]: Self::Saved,
+        grad: FloatTensor<B>,
+        _: [bool; 2],
+    ) -> InputGrads<B, 2> {
+        B::cluster_attention_backward([query, key_value, output, weights, grad], self.clone()).map(Some)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{DType, Device};
+    use burn::tensor::Device;
 
     use super::*;
-    use crate::testing::{assert_close, check_gradients, check_native, devices, random, to_vec};
-
-    fn cluster_attention(
-        query: Tensor<3>,
-        key: Tensor<3>,
-        value: Tensor<3>,
-        segment: Tensor<1, Int>,
-        num_heads: usize,
-    ) -> Tensor<3> {
-        super::cluster_attention(query, Tensor::cat(vec![key, value], 2), segment, num_heads)
-    }
-
-    /// Seven members and four segments per scene, two scenes: unequal sizes, one singleton, one empty segment.
-    const SEGMENTS: [i64; 14] = [0, 0, 2, 0, 1, 2, 0, 5, 7, 7, 5, 4, 5, 4];
-
-    fn segments(device: &Device) -> Tensor<1, Int> {
-        Tensor::from_ints(SEGMENTS, device)
-    }
-
-    fn inputs(device: &Device) -> [Tensor<3>; 3] {
-        [(4, 1), (7, 2), (7, 3)].map(|(count, seed)| random([2, count, 8], seed, device))
-    }
-
-    fn attend([q, k, v]: [Tensor<3>; 3]) -> Tensor<3> {
-        let segments = segments(&q.device());
-        cluster_attention(q, k, v, segments, 2)
-    }
+    use crate::testing::{check_gradients, check_native, devices, random};
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
+        // Seven members and four segments per scene, two scenes: unequal sizes, one singleton, one empty segment.
+        const SEGMENTS: [i64; 14] = [0, 0, 2, 0, 1, 2, 0, 5, 7, 7, 5, 4, 5, 4];
         for device in devices() {
-            check_gradients(inputs(&device), attend, 1e-6);
+            let segments = Tensor::from_ints(SEGMENTS, &device);
+            let inputs = [([2, 4, 8], 1), ([2, 7, 16], 2)].map(|(shape, seed)| random(shape, seed, &device));
+            check_gradients(inputs, |[q, kv]| cluster_attention(q, kv, segments.clone(), 2), 1e-6);
         }
     }
 
     #[test]
-    fn native_kernels_equal_the_composed_operation() {
+    fn native_kernels_equal_f64_at_odd_shapes() {
         let device = Device::flex();
-        check_native(inputs(&device), random([2, 4, 8], 4, &device), attend, 1e-5);
-    }
-
-    #[test]
-    fn a_segment_without_members_gives_zeros() {
-        for device in devices() {
-            let output = to_vec(attend(inputs(&device).map(|x| x.cast(DType::F32))));
-            assert!(output[3 * 8..4 * 8].iter().all(|&value| value == 0.0), "segment 3 has no members");
-        }
-    }
-
-    #[test]
-    fn extreme_logits_of_a_cluster_leave_others_unchanged() {
-        for device in devices() {
-            let q = Tensor::<3>::from_floats([[[1e4, 0.0], [1e-3, 0.0]]], &device);
-            let k = Tensor::<3>::from_floats([[[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [1.0, 0.0]]], &device);
-            let v = Tensor::<3>::from_floats([[[1.0, 2.0], [9.0, 9.0], [3.0, 4.0], [5.0, 6.0]]], &device);
-            let output = cluster_attention(q, k, v, Tensor::from_ints([0, 0, 1, 1], &device), 1);
-            assert_close(&output, &Tensor::from_floats([[[1.0, 2.0], [4.0, 5.0]]], &device), 1e-6);
+        for ([num_segments, heads, width], members) in
+            [([1, 1, 12], 3), ([37, 2, 12], 200), ([19, 3, 96], 77), ([5, 1, 5], 40)]
+        {
+            // Of unequal size, some empty, members in mixed order; the second scene has them in other order.
+            let segment = |i: usize| i * i * 7 % (num_segments + 2) % num_segments;
+            let second = (0..members).map(|i| num_segments + segment(i + 1));
+            let all: Vec<i64> = (0..members).map(segment).chain(second).map(|segment| segment as i64).collect();
+            let segments = Tensor::<1, Int>::from_ints(all.as_slice(), &device);
+            let shapes = [([2, num_segments, heads * width], 1), ([2, members, 2 * heads * width], 2)];
+            let inputs = shapes.map(|(shape, seed)| random(shape, seed, &device));
+            check_native(inputs, |[q, kv]| cluster_attention(q, kv, segments.clone(), heads), 1e-5);
         }
     }
 }

@@ -4,7 +4,7 @@ use burn::backend::Dispatch;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::{Tensor, assert_shape};
 
-use crate::ops::autodiff::Differentiable;
+use crate::ops::autodiff::{Differentiable, InputGrads};
 use crate::ops::backends::dispatch::operations;
 use crate::ops::kernels::Kernels;
 
@@ -20,44 +20,29 @@ pub(crate) fn convolution(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>) -> T
     assert_shape!(x, [batch, inputs, height, width]);
     assert_shape!(weight, [outputs, inputs, 3, 3]);
     assert_shape!(bias, [outputs]);
-    Tensor::from_dispatch(<Dispatch as ConvolutionOps>::convolution(
-        x.into_dispatch(),
-        weight.into_dispatch(),
-        bias.into_dispatch(),
-        Convolution,
-    ))
+    let [x, weight, bias] = [x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch()];
+    Tensor::from_dispatch(<Dispatch as ConvolutionOps>::convolution(x, weight, bias))
 }
-
-/// The operation of [`convolution`].
-#[derive(Clone, Copy, Debug)]
-pub struct Convolution;
 
 operations! {
     /// The operation of [`convolution`] on a backend.
     pub trait ConvolutionOps {
-        fn convolution(x, weight, bias; operation: Convolution) = operation;
+        fn convolution(x, weight, bias;) = Convolution;
     }
 }
 
+#[derive(Clone, Copy, Debug)]
+struct Convolution;
+
 impl<B: Kernels> Differentiable<B, 3> for Convolution {
-    /// Input and weights.
     type Saved = [FloatTensor<B>; 2];
 
-    fn forward(&self, [x, weight, bias]: [FloatTensor<B>; 3]) -> FloatTensor<B> {
-        B::convolution(x, weight, bias)
-    }
-
     fn forward_saving(&self, [x, weight, bias]: [FloatTensor<B>; 3]) -> (FloatTensor<B>, Self::Saved) {
-        (B::convolution(x.clone(), weight.clone(), bias), [x, weight])
+        (B::convolution([x.clone(), weight.clone(), bias]), [x, weight])
     }
 
-    fn gradients(
-        &self,
-        [x, weight]: Self::Saved,
-        grad_output: FloatTensor<B>,
-        _needed: [bool; 3],
-    ) -> [Option<FloatTensor<B>>; 3] {
-        [Some(B::convolution_backward(x, weight, grad_output)), None, None]
+    fn gradients(&self, [x, weight]: Self::Saved, grad: FloatTensor<B>, _: [bool; 3]) -> InputGrads<B, 3> {
+        [Some(B::convolution_backward([x, weight, grad])), None, None]
     }
 }
 

@@ -4,24 +4,13 @@
 //! [`Kernels`](kernels::Kernels), which every backend implements: by native kernels, or, where it has none, by compositions of
 //! Burn's operations.
 //!
-//! Operations, each with its backward:
-//! - `linear`: linear layer, alone or fused with a preceding layer norm or GELU
+//! - `linear`: linear layer, alone or after a layer norm or GELU
 //! - `rms_norm`: RMS norms of the heads of queries and keys
-//! - `attention`: softmax attention
-//! - `cluster_attention`: attention inside clusters
+//! - `attention`, `cluster_attention`: softmax attention, and that inside clusters
 //! - `head_transform`: heads in the frame of a token's camera, for camera-relative attention
 //! - `convolution`: convolutions with constant weights, of the perceptual loss and LPIPS
-//!
-//! Without a backward:
-//! - `matmul`: products
-//! - `optimizer`: updates of parameters
-//!
-//! Backends:
-//! - `kernels`: the trait
-//! - `composed`: its default implementations
-//! - `backends`: the implementation of each backend, a file each
-//!
-//! Shared parts:
+//! - `matmul`, `optimizer`: products and updates of parameters, without a backward
+//! - `kernels`: the trait; `composed`: its default implementations; `backends`: those of each backend
 //! - `autodiff`: an operation as a node of the autodiff graph
 //! - `precision`: f32, bf16 or f16 operands of matrix products, per scope
 //! - `mac_counter`: multiply-accumulates, counted in tests

@@ -98,7 +98,6 @@ impl std::str::FromStr for Precision {
     }
 }
 
-/// Returns why bf16 cannot be used.
 fn missing_bf16(device: &Device) -> Option<String> {
     let set = InstructionSet::detected();
     if *device != Device::flex() {
@@ -110,7 +109,6 @@ fn missing_bf16(device: &Device) -> Option<String> {
     }
 }
 
-/// Returns why f16 cannot be used.
 fn missing_f16(device: &Device) -> Option<String> {
     if !device.supports_dtype(DType::F16) {
         return Some("the device has no f16 (on a GPU, the feature SHADER_F16)".into());
@@ -137,7 +135,10 @@ impl Drop for PrecisionScope {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{devices, error_norms, random, to_vec};
+    use crate::device::name::DeviceName;
+    use crate::ops::attention::{cross_sdpa, self_sdpa};
+    use crate::ops::linear::tests::LAYERS;
+    use crate::testing::{devices, error_norms, output_and_gradients, random, to_vec};
 
     /// Devices with f16, and flex in bf16, which processors without the instructions emulate.
     fn reduced_precisions() -> impl Iterator<Item = (Device, Precision)> {
@@ -148,82 +149,51 @@ mod tests {
 
     #[test]
     fn a_scope_applies_to_one_thread_until_dropped() {
-        assert_eq!(Precision::current(), Precision::F32);
+        let f16 = Precision::F16.scope();
         {
-            let _f16 = Precision::F16.scope();
-            assert_eq!(Precision::current(), Precision::F16);
-            {
-                let _f32 = Precision::F32.scope();
-                assert_eq!(Precision::current(), Precision::F32);
-            }
-            assert_eq!(Precision::current(), Precision::F16);
-            assert_eq!(std::thread::spawn(Precision::current).join().expect("no panic"), Precision::F32);
+            let _bf16 = Precision::Bf16.scope();
+            assert_eq!(Precision::current(), Precision::Bf16);
         }
+        assert_eq!(Precision::current(), Precision::F16);
+        assert_eq!(std::thread::spawn(Precision::current).join().expect("no panic"), Precision::F32);
+        drop(f16);
         assert_eq!(Precision::current(), Precision::F32);
     }
 
     #[test]
-    fn a_device_without_f16_is_refused() {
-        let device = crate::device::name::DeviceName::Ndarray.open().expect("a CPU device");
-        let message = Precision::F16.check("precision", &device).unwrap_err().to_string();
-        assert!(message.starts_with("`precision` = f16: the device has no f16"), "{message}");
-        assert!(Precision::F32.check("precision", &device).is_ok());
+    fn devices_without_a_precision_are_refused() {
+        let ndarray = DeviceName::Ndarray.open().expect("a CPU device");
+        let message = |precision: Precision| precision.check("precision", &ndarray).unwrap_err().to_string();
+        assert!(message(Precision::F16).starts_with("`precision` = f16: the device has no f16"));
+        assert!(message(Precision::Bf16).starts_with("`precision` = bf16: only the device `flex`"));
+        assert!(Precision::F32.check("precision", &ndarray).is_ok());
         assert!(Precision::F16.check("precision", &Device::flex()).is_ok());
-    }
-
-    #[test]
-    fn bf16_needs_flex_and_a_processor_with_it() {
-        let device = crate::device::name::DeviceName::Ndarray.open().expect("a CPU device");
-        let message = Precision::Bf16.check("precision", &device).unwrap_err().to_string();
-        assert!(message.starts_with("`precision` = bf16: only the device `flex`"), "{message}");
         match Precision::Bf16.check("precision", &Device::flex().autodiff()) {
             Ok(()) => assert!(InstructionSet::detected().has_bf16()),
             Err(refused) => assert!(refused.to_string().contains("AVX-512 BF16 is needed"), "{refused}"),
         }
     }
 
-    /// Returns output and gradients of a chain of all operations.
     fn results(device: &Device, precision: Precision, dtype: DType) -> Vec<Tensor<1>> {
-        use crate::ops::attention::{cross_sdpa, self_sdpa};
-        use crate::ops::linear::{gelu_linear, linear, norm_linear};
-        use burn::module::Param;
-        use burn::nn::{LayerNorm, LayerNormConfig, Linear};
-        let device = device.clone().autodiff();
-        let sample = |shape: [usize; 3], seed: u64| random(shape, seed, &device).cast(dtype).detach();
-        let layer = |weight: &Tensor<3>| {
-            let [_, inputs, outputs] = weight.dims();
-            let bias = Tensor::zeros([outputs], (&device, dtype));
-            Linear {
-                weight: Param::from_tensor(weight.clone().reshape([inputs, outputs]).detach()),
-                bias: Some(Param::from_tensor(bias)),
+        let sample = |shape: [usize; 3], seed: u64| random(shape, seed, device).cast(dtype);
+        let inputs = [([2, 9, 16], 1), ([1, 16, 48], 2), ([1, 16, 16], 3), ([1, 16, 32], 4), ([1, 16, 16], 5)];
+        let [linear, gelu_linear, norm_linear] = LAYERS.map(|layer| {
+            move |x: Tensor<3>, weight: Tensor<3>| {
+                let beta = x.zeros_like().slice([0..1, 0..1, 0..16]);
+                let bias = weight.zeros_like().slice([0..1, 0..1]);
+                layer([x, beta.ones_like(), beta, weight, bias])
             }
-        };
-        let x = sample([2, 9, 16], 1).require_grad();
-        let weights = [[1, 16, 48], [1, 16, 16], [1, 16, 32], [1, 16, 16]];
-        let weights: Vec<_> = weights.into_iter().zip(2..).map(|(shape, seed)| sample(shape, seed)).collect();
-        let layers: Vec<_> = weights.iter().map(layer).collect();
-        let mut norm: LayerNorm = LayerNormConfig::new(16).init(&device);
-        norm.gamma = Param::from_tensor(norm.gamma.val().cast(dtype).detach());
-        norm.beta = norm.beta.map(|beta| Param::from_tensor(beta.val().cast(dtype).detach()));
-        let output = {
+        });
+        let chain = |[x, packed, query, key_value, out]: [Tensor<3>; 5]| {
             let _scope = precision.scope();
-            let mixed = self_sdpa(norm_linear(&norm, &layers[0], x.clone()), 2);
-            let query = gelu_linear(&layers[1], mixed.clone());
-            linear(&layers[3], cross_sdpa(query, linear(&layers[2], mixed), 4))
+            let mixed = self_sdpa(norm_linear(x, packed), 2);
+            linear(cross_sdpa(gelu_linear(mixed.clone(), query), linear(mixed, key_value), 4), out)
         };
-        assert_eq!(output.dtype(), dtype, "results are not f16");
-        let cotangent = random([2, 9, 16], 9, &device).cast(dtype);
         // Outside the scope: a backward has the precision of its forward.
-        let grads = (output.clone() * cotangent).sum().backward();
-        let gradient = |grad: Option<Tensor<2>>| {
-            let grad = grad.expect("tracked");
-            assert_eq!(grad.dtype(), dtype, "gradients are not f16");
-            grad.flatten(0, 1)
-        };
-        let mut all = vec![output.inner().flatten(0, 2)];
-        all.push(gradient(x.grad(&grads).map(|grad| grad.flatten(0, 1))));
-        all.extend(layers.iter().map(|layer| gradient(layer.weight.val().grad(&grads))));
-        all
+        let inputs = inputs.map(|(shape, seed)| sample(shape, seed));
+        let (output, grads) = output_and_gradients(inputs, sample([2, 9, 16], 9), chain);
+        assert!(grads.iter().chain([&output]).all(|result| result.dtype() == dtype), "results have the type of inputs");
+        [output].into_iter().chain(grads).map(|result| result.flatten(0, 2)).collect()
     }
 
     #[test]
@@ -258,8 +228,7 @@ mod tests {
             // Scores of 50 x 100 x 4.
             let query = Tensor::<3>::full([1, 2, 4], 100.0, &device);
             let keys = query.clone().slice([0..1, 0..1, 0..4]);
-            let output =
-                crate::ops::attention::cross_sdpa(query, Tensor::cat(vec![keys.clone(), keys.ones_like()], 2), 1);
+            let output = cross_sdpa(query, Tensor::cat(vec![keys.clone(), keys.ones_like()], 2), 1);
             assert!(to_vec(output).iter().all(|value| (value - 1.0).abs() < 1e-3));
         }
     }

@@ -6,7 +6,7 @@ use burn::nn::RmsNorm;
 use burn::tensor::Tensor;
 use clift_kernels::HeadRows;
 
-use crate::ops::autodiff::Differentiable;
+use crate::ops::autodiff::{Differentiable, InputGrads};
 use crate::ops::backends::dispatch::operations;
 use crate::ops::kernels::Kernels;
 
@@ -32,32 +32,23 @@ fn apply(x: Tensor<3>, gammas: Tensor<1>, rows: HeadRows) -> Tensor<3> {
 operations! {
     /// The operation of [`rms_norm_heads`] on a backend; `gammas` has those of all norms.
     pub trait RmsNormOps {
-        fn rms_norm_heads(x, gammas; rows: HeadRows) = HeadNorms(rows);
+        fn rms_norm_heads(x, gammas; rows: HeadRows) = rows;
     }
 }
 
-#[derive(Clone, Copy, Debug)]
-struct HeadNorms(HeadRows);
-
-impl<B: Kernels> Differentiable<B, 2> for HeadNorms {
-    /// Inputs.
+impl<B: Kernels> Differentiable<B, 2> for HeadRows {
     type Saved = [FloatTensor<B>; 2];
 
     fn forward(&self, inputs: [FloatTensor<B>; 2]) -> FloatTensor<B> {
-        B::rms_norm_forward(inputs, self.0)
+        B::rms_norm_forward(inputs, *self)
     }
 
     fn forward_saving(&self, inputs: [FloatTensor<B>; 2]) -> (FloatTensor<B>, Self::Saved) {
-        (B::rms_norm_forward(inputs.clone(), self.0), inputs)
+        (B::rms_norm_forward(inputs.clone(), *self), inputs)
     }
 
-    fn gradients(
-        &self,
-        inputs: Self::Saved,
-        grad_output: FloatTensor<B>,
-        _needed: [bool; 2],
-    ) -> [Option<FloatTensor<B>>; 2] {
-        B::rms_norm_backward(inputs, grad_output, self.0).map(Some)
+    fn gradients(&self, [x, gammas]: Self::Saved, grad: FloatTensor<B>, _: [bool; 2]) -> InputGrads<B, 2> {
+        B::rms_norm_backward([x, gammas, grad], *self).map(Some)
     }
 }
 
@@ -67,65 +58,45 @@ mod tests {
 
     use super::*;
     use crate::testing::{
-        assert_close, assert_finite, check_equal, check_gradients, check_native, devices, output_and_gradients, random,
+        assert_close, assert_finite, check_gradients, check_native, devices, output_and_gradients, random,
     };
 
-    /// Normalizes the first two of three parts; gammas are `[1, 1, E]`.
-    fn norm([x, query, key]: [Tensor<3>; 3]) -> Tensor<3> {
-        let ([_, _, width], [_, _, head_width]) = (x.dims(), query.dims());
-        let rows = HeadRows { num_parts: 3, num_heads: width / 3 / head_width, head_width, epsilon: 1e-5 };
-        apply(x, Tensor::cat(vec![query, key], 2).reshape([2 * head_width]), rows)
+    /// Returns the norm of the first `K` parts of rows with their gammas, `[1, 1, K E]`.
+    fn norm([num_parts, num_heads, head_width]: [usize; 3]) -> impl Fn([Tensor<3>; 2]) -> Tensor<3> {
+        let rows = HeadRows { num_parts, num_heads, head_width, epsilon: 1e-5 };
+        move |[x, gammas]| apply(x, gammas.flatten(0, 2), rows)
     }
 
-    fn inputs(num_heads: usize, head_width: usize, device: &Device) -> [Tensor<3>; 3] {
-        let shapes = [[2, 35, 3 * num_heads * head_width], [1, 1, head_width], [1, 1, head_width]];
-        let mut seed = 0;
-        shapes.map(|shape| {
-            seed += 1;
-            random(shape, seed, device)
-        })
-    }
-
-    /// The operation as Burn's own norms of the parts.
-    fn plain([x, query, key]: [Tensor<3>; 3]) -> Tensor<3> {
-        let ([batch, count, width], [_, _, head_width]) = (x.dims(), query.dims());
-        let part = |i: usize| x.clone().narrow(2, i * width / 3, width / 3);
-        let norm = |x: Tensor<3>, gamma: Tensor<3>| {
-            let x = x.reshape([batch, count, width / 3 / head_width, head_width]);
-            let scale = (x.clone().square().mean_dim(3) + 1e-5).sqrt();
-            (x / scale * gamma.unsqueeze_dim(2)).reshape([batch, count, width / 3])
-        };
-        Tensor::cat(vec![norm(part(0), query), norm(part(1), key), part(2)], 2)
+    fn inputs(count: usize, sizes: [usize; 3], num_gammas: usize, device: &Device) -> [Tensor<3>; 2] {
+        let shapes = [([1, count, sizes.iter().product()], 1), ([1, 1, num_gammas * sizes[2]], 2)];
+        shapes.map(|(shape, seed)| random(shape, seed, device))
     }
 
     #[test]
-    fn gradients_equal_central_differences_and_plain_autodiff_in_f64() {
+    fn gradients_equal_central_differences_in_f64() {
         for device in devices() {
-            let [x, query, key] = inputs(2, 6, &device);
-            check_gradients([x.narrow(1, 0, 3), query, key], norm, 1e-6);
-            let cotangent = random([2, 35, 36], 9, &device);
-            check_equal(inputs(2, 6, &device), cotangent, norm, plain, 1e-12);
+            for num_gammas in [1, 2, 3] {
+                check_gradients(inputs(3, [3, 2, 6], num_gammas, &device), norm([3, 2, 6]), 1e-6);
+            }
         }
     }
 
     #[test]
-    fn native_kernels_equal_the_composed_operation() {
-        let device = Device::flex();
-        for (num_heads, head_width) in [(2, 8), (3, 32), (1, 37)] {
-            let cotangent = random([2, 35, 3 * num_heads * head_width], 4, &device);
-            check_native(inputs(num_heads, head_width, &device), cotangent, norm, 1e-5);
+    fn native_kernels_equal_f64_at_odd_shapes() {
+        for (count, sizes, num_gammas) in
+            [(1, [1, 1, 5], 1), (700, [3, 4, 32], 2), (333, [2, 3, 8], 1), (65, [3, 2, 37], 3), (9, [3, 12, 64], 2)]
+        {
+            check_native(inputs(count, sizes, num_gammas, &Device::flex()), norm(sizes), 1e-5);
         }
     }
 
     #[test]
     fn a_head_of_zeros_gives_zeros_and_finite_gradients() {
         for device in devices() {
-            let inputs = inputs(2, 8, &device).map(|input| input.cast(DType::F32));
-            let [_, query, key] = inputs;
-            let x = Tensor::<3>::zeros([1, 2, 48], &device);
-            let cotangent = random([1, 2, 48], 3, &device).cast(DType::F32);
-            let (output, grads) = output_and_gradients([x.clone(), query, key], cotangent, norm);
-            assert_close(&output, &x, 1e-12);
+            let [x, gammas] = inputs(2, [3, 2, 8], 2, &device).map(|input| input.cast(DType::F32));
+            let zeros = x.zeros_like();
+            let (output, grads) = output_and_gradients([zeros.clone(), gammas], x, norm([3, 2, 8]));
+            assert_close(&output, &zeros, 1e-12);
             assert_finite(grads);
         }
     }

@@ -18,9 +18,6 @@ impl SceneClusters {
     /// # Shapes
     /// - `assignment`: cluster of every token, `[num_tokens]`
     /// - `centroid_index`: centroid token of every cluster, `[num_storage_tokens]`
-    ///
-    /// # Errors
-    /// [`ModelError::BadClusters`] for an index out of range or a centroid outside its cluster.
     pub fn new(assignment: Vec<u32>, centroid_index: Vec<u32>) -> Result<Self, ModelError> {
         let (tokens, clusters) = (assignment.len(), centroid_index.len());
         let bad = |reason: String| Err(ModelError::BadClusters { reason });
@@ -54,33 +51,6 @@ impl SceneClusters {
     pub fn centroid_index(&self) -> &[u32] {
         &self.centroid_index
     }
-
-    /// Returns the variance of tokens `[num_tokens, dim]` within the clusters, as a share of their total variance; 0 of equal
-    /// tokens.
-    ///
-    /// # Panics
-    /// If there are not `num_tokens` rows.
-    pub fn variance_within(&self, tokens: &[f32]) -> f64 {
-        let num_tokens = self.assignment.len();
-        assert!(num_tokens > 0 && tokens.len().is_multiple_of(num_tokens), "a row per token");
-        let rows = || tokens.chunks((tokens.len() / num_tokens).max(1));
-        let around_means = |group: &dyn Fn(usize) -> usize, num_groups: usize| {
-            let mut sums = vec![vec![0.0; tokens.len() / num_tokens]; num_groups];
-            let mut counts = vec![0.0; num_groups];
-            for (token, row) in rows().enumerate() {
-                counts[group(token)] += 1.0;
-                sums[group(token)].iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
-            }
-            let distance = |(token, row): (usize, &[f32])| {
-                let (sum, count) = (&sums[group(token)], counts[group(token)]);
-                row.iter().zip(sum).map(|(&value, sum)| (f64::from(value) - sum / count).powi(2)).sum::<f64>()
-            };
-            rows().enumerate().map(distance).sum::<f64>()
-        };
-        let total = around_means(&|_| 0, 1);
-        let within = around_means(&|token| self.assignment[token] as usize, self.centroid_index.len());
-        if total > 0.0 { within / total } else { 0.0 }
-    }
 }
 
 /// Clusters of a batch of scenes with the same counts.
@@ -91,9 +61,6 @@ pub struct Clusters {
 
 impl Clusters {
     /// Combines scenes into a batch.
-    ///
-    /// # Errors
-    /// [`ModelError::BadClusters`] without scenes, or if their counts differ.
     pub fn new(scenes: Vec<SceneClusters>) -> Result<Self, ModelError> {
         let counts = |scene: &SceneClusters| (scene.assignment.len(), scene.centroid_index.len());
         let Some(first) = scenes.first().map(counts) else {
@@ -145,7 +112,6 @@ impl Clusters {
         ClusterIndex {
             batch,
             num_tokens,
-            num_storage_tokens,
             centroid: index(centroid),
             segment: index(all_segments),
             members: (num_members > 0).then(|| Members { token: index(member), segment: index(segment) }),
@@ -163,7 +129,6 @@ impl Clusters {
 pub struct ClusterIndex {
     pub(crate) batch: usize,
     pub(crate) num_tokens: usize,
-    pub(crate) num_storage_tokens: usize,
     /// Token row of every centroid, `[B * S]`.
     pub(crate) centroid: Tensor<1, Int>,
     /// Centroid row of every token, centroids included, `[B * N]`.
@@ -201,17 +166,6 @@ impl ClusterIndex {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::to_vec;
-
-    #[test]
-    fn variance_within_is_a_share_of_the_total() {
-        // Means (1, 0) and (7, 2) of the clusters, (4, 1) of all tokens.
-        let clusters = SceneClusters::new(vec![0, 1, 0, 1], vec![0, 1]).unwrap();
-        let tokens = [0.0, 0.0, 7.0, 4.0, 2.0, 0.0, 7.0, 0.0];
-        assert_eq!(clusters.variance_within(&tokens), (2.0 + 8.0) / (17.0 + 18.0 + 5.0 + 10.0));
-        assert_eq!(clusters.variance_within(&[3.0; 8]), 0.0, "equal tokens");
-        assert_eq!(SceneClusters::identity(4).variance_within(&tokens), 0.0);
-    }
 
     #[test]
     fn inconsistent_indices_are_refused() {
@@ -223,21 +177,5 @@ mod tests {
         assert_eq!(message(&[0, 0], &[1, 0]), "bad clusters: token 0, the centroid of cluster 1, is in cluster 0");
         assert!(Clusters::new(vec![SceneClusters::identity(2), SceneClusters::identity(3)]).is_err());
         assert!(Clusters::new(Vec::new()).is_err());
-    }
-
-    #[test]
-    fn gathering_selects_the_rows_of_each_scene() {
-        let device = Device::flex();
-        let clusters = Clusters::new(vec![
-            SceneClusters::new(vec![0, 1, 0], vec![2, 1]).expect("valid"),
-            SceneClusters::new(vec![1, 0, 1], vec![1, 0]).expect("valid"),
-        ])
-        .expect("equal counts");
-        let index = clusters.upload(&device);
-        let tokens = Tensor::<1, Int>::arange(0..6, &device).float().reshape([2, 3, 1]);
-        assert_eq!(to_vec(index.gather(tokens, &index.centroid)), [2.0, 1.0, 4.0, 3.0]);
-        let members = index.members.expect("one per scene");
-        assert_eq!(members.token.into_data().convert::<i64>().try_to_vec::<i64>().expect("ints"), [0, 5]);
-        assert_eq!(members.segment.into_data().convert::<i64>().try_to_vec::<i64>().expect("ints"), [0, 3]);
     }
 }

@@ -18,9 +18,6 @@ pub enum TokenCount {
 
 impl TokenCount {
     /// Returns the number of tokens for a scene of `num_tokens`.
-    ///
-    /// # Errors
-    /// [`ModelError::BadTokenCount`] if the scene has fewer tokens.
     pub fn of(self, num_tokens: usize) -> Result<usize, ModelError> {
         match self {
             _ if num_tokens == 0 => Err(ModelError::BadTokenCount {
@@ -103,18 +100,24 @@ impl<'de> Deserialize<'de> for TokenCount {
 mod tests {
     use super::*;
 
-    fn parse(text: &str) -> TokenCount {
-        text.parse().expect("valid")
-    }
-
     #[test]
     fn counts_and_shares_resolve_against_a_scene() {
-        assert_eq!(parse("256").of(4096).expect("fits"), 256);
-        assert_eq!(parse("1/16").of(4096).expect("fits"), 256);
-        assert_eq!(parse("0.0625").of(48).expect("fits"), 3);
-        assert_eq!(parse("1/3").of(48).expect("fits"), 16);
-        assert_eq!(parse("1/1000").of(48).expect("at least one"), 1);
-        assert_eq!(parse("1.0").of(48).expect("all"), 48);
+        let cases = [
+            ("256", 4096, 256),
+            ("1/16", 4096, 256),
+            ("0.0625", 48, 3),
+            ("1/3", 48, 16),
+            ("1/1000", 48, 1),
+            ("1.0", 48, 48),
+        ];
+        for (text, num_tokens, expected) in cases {
+            assert_eq!(text.parse::<TokenCount>().unwrap().of(num_tokens).unwrap(), expected, "{text}");
+        }
+        // In JSON too, 1.0 is all tokens.
+        let list: Vec<TokenCount> = serde_json::from_str(r#"[16, "1/4", 0.5, 1.0, 1]"#).unwrap();
+        assert_eq!(list.iter().map(|count| count.of(64).unwrap()).collect::<Vec<_>>(), [16, 16, 32, 64, 1]);
+        let text = serde_json::to_string(&list).unwrap();
+        assert_eq!(serde_json::from_str::<Vec<TokenCount>>(&text).unwrap(), list);
     }
 
     #[test]
@@ -123,17 +126,8 @@ mod tests {
             let message = text.parse::<TokenCount>().unwrap_err().to_string();
             assert!(message.contains(part), "{message}");
         }
-        assert!(parse("1/2").of(0).is_err());
+        assert!(TokenCount::Share(0.5).of(0).is_err());
         assert!(serde_json::from_str::<TokenCount>("-1").unwrap_err().to_string().contains("`-1.0` tokens"));
-        assert!(parse("300").of(256).unwrap_err().to_string().contains("a scene has 256 tokens"));
-    }
-
-    #[test]
-    fn json_round_trips_and_1_0_means_all_tokens() {
-        let list: Vec<TokenCount> = serde_json::from_str(r#"[16, "1/4", 0.5, 1.0, 1]"#).expect("valid");
-        assert_eq!(list[3].of(64).expect("all"), 64);
-        assert_eq!(list[4].of(64).expect("one"), 1);
-        let text = serde_json::to_string(&list).expect("serialises");
-        assert_eq!(serde_json::from_str::<Vec<TokenCount>>(&text).expect("valid"), list);
+        assert!(TokenCount::Count(300).of(256).unwrap_err().to_string().contains("a scene has 256 tokens"));
     }
 }

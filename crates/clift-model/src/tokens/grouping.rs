@@ -34,9 +34,6 @@ impl Grouping {
     /// Groups the tokens of `num_views` views of `grid` rows and columns of patches into `count` groups.
     ///
     /// `tokens` computes the encoder tokens `[1, N, D]`, if the grouping [reads](Self::reads_tokens) them.
-    ///
-    /// # Errors
-    /// Those of [`KMeans::fit`]; [`ModelError::BadClusters`] for fewer tiles than views.
     pub fn group(
         self,
         count: usize,

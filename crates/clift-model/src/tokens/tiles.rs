@@ -22,9 +22,6 @@ struct Tile {
 ///
 /// # Shapes
 /// - returns the groups of `num_views * rows * columns` tokens in the order view, row, column
-///
-/// # Errors
-/// [`ModelError::BadClusters`] for fewer tiles than views, or more tiles than tokens.
 pub(crate) fn tile_clusters(num_views: usize, grid: [usize; 2], num_tiles: usize) -> Result<SceneClusters, ModelError> {
     let [rows, columns] = grid;
     let num_tokens = num_views * rows * columns;
@@ -80,45 +77,24 @@ mod tests {
 
     use super::*;
 
-    /// Returns the rows and columns that every cluster spans in its view, and its tokens.
-    fn spans(clusters: &SceneClusters, grid: [usize; 2]) -> Vec<([usize; 2], Vec<usize>)> {
-        let of = |cluster: usize| {
-            let assignment = clusters.assignment().iter().enumerate();
-            let tokens: Vec<usize> = assignment.filter(|(_, own)| **own as usize == cluster).map(|(t, _)| t).collect();
-            let span = |place: fn(usize, [usize; 2]) -> usize| {
-                let places: BTreeSet<usize> = tokens.iter().map(|&token| place(token, grid)).collect();
-                places.last().unwrap() - places.first().unwrap() + 1
-            };
-            ([span(|t, [r, c]| t / c % r), span(|t, [_, c]| t % c)], tokens)
-        };
-        (0..clusters.centroid_index().len()).map(of).collect()
-    }
-
     #[test]
-    fn sixteen_tiles_of_four_views_are_squares() {
-        let clusters = tile_clusters(4, [8, 8], 16).unwrap();
-        assert!(spans(&clusters, [8, 8]).iter().all(|(span, tokens)| *span == [4, 4] && tokens.len() == 16));
-        // Of the first view: tokens (2, 2), (2, 6), (6, 2), (6, 6), in some order.
-        let first: BTreeSet<u32> = clusters.centroid_index()[..4].iter().copied().collect();
-        assert_eq!(first, BTreeSet::from([2 * 8 + 2, 2 * 8 + 6, 6 * 8 + 2, 6 * 8 + 6]));
-    }
-
-    #[test]
-    fn every_count_gives_disjoint_rectangles() {
-        for grid in [[1, 1], [1, 7], [3, 3], [4, 6], [5, 2], [8, 8]] {
+    fn every_count_gives_disjoint_rectangles_of_one_view_around_their_centroids() {
+        for [rows, columns] in [[1, 1], [1, 7], [3, 3], [4, 6], [5, 2], [8, 8]] {
             for num_views in [1, 3] {
-                for num_tiles in num_views..=num_views * grid[0] * grid[1] {
-                    let clusters = tile_clusters(num_views, grid, num_tiles).unwrap();
+                for num_tiles in num_views..=num_views * rows * columns {
+                    let clusters = tile_clusters(num_views, [rows, columns], num_tiles).unwrap();
                     assert_eq!(clusters.centroid_index().len(), num_tiles);
-                    let tiles = spans(&clusters, grid);
-                    for ([rows, columns], tokens) in &tiles {
-                        assert_eq!(rows * columns, tokens.len(), "a rectangle in one view: {grid:?}, {num_tiles}");
-                        assert_eq!(tokens[0] / (grid[0] * grid[1]), tokens[tokens.len() - 1] / (grid[0] * grid[1]));
+                    for (tile, &centroid) in clusters.centroid_index().iter().enumerate() {
+                        let own =
+                            clusters.assignment().iter().enumerate().filter(|(_, other)| **other as usize == tile);
+                        let place = |token: usize| [token / (rows * columns), token / columns % rows, token % columns];
+                        let places: BTreeSet<[usize; 3]> = own.map(|(token, _)| place(token)).collect();
+                        let (first, last) = (places.first().unwrap(), places.last().unwrap());
+                        let [views, height, width] = [0, 1, 2].map(|axis| last[axis] - first[axis] + 1);
+                        assert_eq!((views, height * width), (1, places.len()), "{rows} x {columns}, {num_tiles}");
+                        let middle = [first[0], first[1] + height / 2, first[2] + width / 2];
+                        assert_eq!(place(centroid as usize), middle);
                     }
-                    assert_eq!(
-                        tiles.iter().map(|(_, tokens)| tokens.len()).sum::<usize>(),
-                        clusters.assignment().len()
-                    );
                 }
             }
         }
@@ -126,9 +102,9 @@ mod tests {
 
     #[test]
     fn counts_out_of_range_are_refused() {
-        let message = |count| tile_clusters(2, [3, 4], count).unwrap_err().to_string();
         for count in [0, 1, 25] {
-            assert!(message(count).contains("use 2 to 24"), "{}", message(count));
+            let message = tile_clusters(2, [3, 4], count).unwrap_err().to_string();
+            assert!(message.contains("use 2 to 24"), "{message}");
         }
     }
 }

@@ -22,7 +22,7 @@ pub fn patchify(pixels: Tensor<5>, patch_size: usize) -> Tensor<3> {
         .reshape([batch, views * rows * columns, patch_size * patch_size * channels])
 }
 
-/// Assembles images from patch vectors: the inverse of [`patchify`].
+/// Assembles images from patch vectors: the inverse of `patchify`.
 ///
 /// # Shapes
 /// - `patches`: `[batch, views * (height / patch_size) * (width / patch_size), patch_size^2 * channels]`

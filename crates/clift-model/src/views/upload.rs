@@ -29,22 +29,12 @@ pub struct Views {
 }
 
 impl Cameras {
-    /// Copies the cameras of views to a device, one set of views per scene.
-    ///
-    /// # Shapes
-    /// - `scenes`: sets of the same number of views of the same size
-    /// - returns `[batch, views]`
-    ///
-    /// # Errors
-    /// [`ModelError::WrongLength`] if the sets differ in number, [`ModelError::NotFinite`] for a camera.
+    /// Copies the cameras of views to a device, one set of views per scene, of the same number and size.
     pub fn upload(scenes: &[&ClipViews], device: &Device) -> Result<Self, ModelError> {
         Self::of_cameras(scenes.iter().flat_map(|views| &views.cameras), shape(scenes), device)
     }
 
     /// Copies the cameras of one scene to a device, for images of `height` by `width` pixels.
-    ///
-    /// # Errors
-    /// [`ModelError::NotFinite`] for a camera.
     pub fn of_views(views: &[Camera], height: usize, width: usize, device: &Device) -> Result<Self, ModelError> {
         Self::of_cameras(views, [1, views.len(), height, width], device)
     }
@@ -56,12 +46,15 @@ impl Cameras {
     ) -> Result<Self, ModelError> {
         let (mut c2w, mut intrinsics) = (Vec::new(), Vec::new());
         for camera in cameras {
-            c2w.extend(camera.c2w.to_matrix());
+            c2w.extend(camera.c2w.to_matrix_f64().map(|value| value as f32));
             intrinsics.extend(camera.intrinsics.to_array().map(|value| value as f32));
         }
         check_length("cameras", c2w.len() / 16, batch * views)?;
-        check_finite("c2w", &c2w)?;
-        check_finite("intrinsics", &intrinsics)?;
+        for (name, values) in [("c2w", &c2w), ("intrinsics", &intrinsics)] {
+            if let Some(position) = values.iter().position(|value: &f32| !value.is_finite()) {
+                return Err(ModelError::NotFinite { name, value: values[position], position });
+            }
+        }
         Ok(Self {
             height,
             width,
@@ -78,20 +71,14 @@ impl Cameras {
 }
 
 impl Views {
-    /// Copies images and cameras to a device, one set of views per scene; pixels are scaled to `[0, 1]`.
-    ///
-    /// # Shapes
-    /// - `scenes`: as [`Cameras::upload`]
+    /// Copies images and cameras to a device, as [`upload_images`] and [`Cameras::upload`].
     pub fn upload(scenes: &[&ClipViews], device: &Device) -> Result<Self, ModelError> {
         Ok(Self { images: upload_images(scenes, device)?, cameras: Cameras::upload(scenes, device)? })
     }
 }
 
-/// Copies images to a device as RGB in `[0, 1]`, the same bits on every device.
-///
-/// # Shapes
-/// - `scenes`: sets of the same number of views of the same size
-/// - returns `[batch, views, height, width, 3]`
+/// Copies images to a device as RGB in `[0, 1]`, `[batch, views, height, width, 3]`, the same bits on every device. Scenes have
+/// sets of the same number of views of the same size.
 pub fn upload_images(scenes: &[&ClipViews], device: &Device) -> Result<Tensor<5>, ModelError> {
     let [batch, views, height, width] = shape(scenes);
     let images = scenes.iter().map(|views| &views.images[..]).collect::<Vec<_>>().concat();
@@ -132,13 +119,6 @@ fn upload_packed(bytes: &[u8], device: &Device) -> Tensor<1> {
 
 fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), ModelError> {
     if got == expected { Ok(()) } else { Err(ModelError::WrongLength { name, expected, got }) }
-}
-
-fn check_finite(name: &'static str, values: &[f32]) -> Result<(), ModelError> {
-    match values.iter().position(|value| !value.is_finite()) {
-        Some(position) => Err(ModelError::NotFinite { name, value: values[position], position }),
-        None => Ok(()),
-    }
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 
 use crate::network::architecture::CameraEncoding;
 use crate::network::config::ModelConfig;
-use crate::network::parts::renderer::Renderer;
+use crate::network::renderer::Renderer;
 
 /// Hashes paths, shapes and values of all parameters of a module; returns 64 hexadecimal digits. Equal weights have equal
 /// hashes on every device.
@@ -28,8 +28,8 @@ pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, camera_encoding, .. } = config;
     // The paper's encoding is not named: the hashes are part of scene files.
     let encoding = match camera_encoding {
-        CameraEncoding::Plucker => String::new(),
-        other => format!("{other} "),
+        CameraEncoding::Plucker => "",
+        CameraEncoding::Gta => "gta ",
     };
     hex::encode(Sha256::digest(format!("{variant} {num_heads} {encoding}{}", weights_hash(renderer))))
 }

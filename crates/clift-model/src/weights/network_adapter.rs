@@ -11,51 +11,33 @@ use burn::tensor::{Bytes, DType, Shape, Tensor};
 use crate::error::ModelError;
 use crate::network::architecture::Architecture;
 use crate::network::config::ModelConfig;
-use crate::views::rays::RayFrame;
 use crate::weights::model_path::{check_equal_sizes, read_config};
 
-/// Adapts the layers between pixels and tokens to patches `factor` times as long, and from rays in the frame of the scene to rays
-/// in the frame of the camera, and adds blocks. The default changes nothing.
+/// Adapts the layers between pixels and tokens to longer patches, and adds blocks. The default changes nothing.
 ///
-/// At first, the network sees the mean of every `factor` by `factor` pixels and repeats each pixel it renders as often. Rays in
-/// the frame of the camera keep the weights of directions and lose those of moments, which changes the image until it is trained.
+/// At first, the network sees the mean of every `factor` by `factor` pixels and repeats each pixel it renders as often.
 ///
 /// Added blocks follow those of the file. Their output layers are zero, so at first they change nothing
 /// ([`close_added_blocks`](Self::close_added_blocks)).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct NetworkAdapter {
-    /// Side of the patches in the file, in pixels.
-    patch_size: usize,
-    factor: usize,
-    rays: RayFrame,
-    drops_moments: bool,
+    /// Side of the patches in the file, in pixels, and the factor by which those of the network are longer.
+    patches: Option<(usize, usize)>,
     /// Number of blocks of the encoder and of the renderer in the file, where the network has more.
     num_blocks: Option<[usize; 2]>,
 }
 
-impl Default for NetworkAdapter {
-    fn default() -> Self {
-        Self { patch_size: 1, factor: 1, rays: RayFrame::World, drops_moments: false, num_blocks: None }
-    }
-}
-
 impl NetworkAdapter {
-    /// Returns the adapter of the weights in `dir` to `model`, and checks that the networks have equal sizes otherwise. Groups of
-    /// views may differ.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] with the first other size, [`ModelError::BadConfigFile`] for a config that cannot be read.
+    /// Returns the adapter of the weights in `dir` to `model`, and checks that the networks have equal sizes otherwise.
     pub fn find(model: &ModelConfig, dir: &Path) -> Result<Self, ModelError> {
         let Some(found) = read_config(dir)? else { return Ok(Self::default()) };
-        let mut model = ModelConfig { group_size: found.group_size, ..model.clone() };
-        let factor = model.patch_size / found.patch_size.max(1);
-        let mut adapter = Self { patch_size: found.patch_size, rays: found.rays, ..Self::default() };
+        let mut model = model.clone();
+        let mut adapter = Self::default();
         if found.architecture == Architecture::Clift {
-            if factor * found.patch_size == model.patch_size {
-                adapter.factor = factor;
-                adapter.drops_moments = found.rays == RayFrame::World && model.rays == RayFrame::Camera;
+            let factor = model.patch_size / found.patch_size.max(1);
+            if factor > 1 && factor * found.patch_size == model.patch_size {
+                adapter.patches = Some((found.patch_size, factor));
                 model.patch_size = found.patch_size;
-                model.rays = if adapter.drops_moments { found.rays } else { model.rays };
             }
             let num_blocks = |config: &ModelConfig| [config.num_encoder_blocks, config.num_renderer_blocks];
             let (blocks, former) = (num_blocks(&model), num_blocks(&found));
@@ -65,46 +47,15 @@ impl NetworkAdapter {
             }
         }
         check_equal_sizes(&model, &found, dir)?;
-        let is_equal = adapter.factor == 1 && !adapter.drops_moments && adapter.num_blocks.is_none();
-        Ok(if is_equal { Self::default() } else { adapter })
+        Ok(adapter)
     }
 
     /// Describes the change; `None` without one.
     pub fn describe(&self) -> Option<String> {
-        let Self { patch_size, factor, drops_moments, num_blocks, .. } = *self;
-        let longer = (factor > 1).then(|| format!("patches of {} instead of {patch_size} pixels", factor * patch_size));
-        let rays = drops_moments.then(|| "rays in the frame of the camera instead of the scene".into());
-        let deeper = num_blocks.map(|[encoder, renderer]| format!("more than {encoder} + {renderer} blocks"));
-        let changes: Vec<String> = longer.into_iter().chain(rays).chain(deeper).collect();
+        let longer = |(side, factor)| format!("patches of {} instead of {side} pixels", factor * side);
+        let deeper = |[encoder, renderer]: [usize; 2]| format!("more than {encoder} + {renderer} blocks");
+        let changes: Vec<String> = self.patches.map(longer).into_iter().chain(self.num_blocks.map(deeper)).collect();
         (!changes.is_empty()).then(|| format!("adapted to {}", changes.join(" and ")))
-    }
-
-    /// Returns the length of a patch vector in the file, and which of its values each value of the longer vector comes from. A
-    /// pixel has `num_colors` channels of colour, then the coordinates of its ray if there are `rays`.
-    fn sources(&self, num_colors: usize, rays: bool) -> (usize, Vec<usize>) {
-        let Self { patch_size, factor, drops_moments, .. } = *self;
-        let num_coordinates = if rays { self.rays.num_coordinates() } else { 0 };
-        let dropped = if rays && drops_moments { num_colors..num_colors + 3 } else { 0..0 };
-        let channels = num_colors + num_coordinates;
-        let kept = (0..channels).filter(|channel| !dropped.contains(channel));
-        let side = 0..factor * patch_size;
-        let pixels = side.clone().flat_map(|y| side.clone().map(move |x| (y / factor) * patch_size + x / factor));
-        let sources = pixels.flat_map(|pixel| kept.clone().map(move |channel| pixel * channels + channel)).collect();
-        (patch_size * patch_size * channels, sources)
-    }
-
-    /// Returns the values of a layer with longer patches.
-    fn with_longer_patches(&self, name: &str, layer: Values) -> Values {
-        // Linear weights are `[inputs, outputs]`.
-        let (num_colors, rays, axis, scale) = match name {
-            "encoder.patch_embed.weight" => (3, true, 0, 1.0 / (self.factor * self.factor) as f32),
-            "renderer.ray_embed.weight" => (0, true, 0, 1.0 / (self.factor * self.factor) as f32),
-            "renderer.to_pixels.weight" | "renderer.to_pixels.bias" => (3, false, 1, 1.0),
-            _ => return layer,
-        };
-        let (expected_len, sources) = self.sources(num_colors, rays);
-        // Another shape is an error of the file, with its own message.
-        if layer.shape[axis] == expected_len { layer.gather(axis, &sources, scale) } else { layer }
     }
 
     /// Sets the output layers of added blocks to zero.
@@ -113,8 +64,16 @@ impl NetworkAdapter {
         network.map(&mut CloseBlocks { num_blocks, path: Vec::new() })
     }
 
-    fn adapted(&self, tensor: &PackTensor) -> Option<PackTensor> {
-        let shape = match tensor.shape[..] {
+    /// Returns a layer with longer patches; `None` for every other layer.
+    fn with_longer_patches(&self, tensor: &PackTensor) -> Option<PackTensor> {
+        let (patch_size, factor) = self.patches?;
+        // Linear weights are `[inputs, outputs]`.
+        let (axis, scale) = match tensor.name.as_str() {
+            "encoder.patch_embed.weight" | "renderer.ray_embed.weight" => (0, 1.0 / (factor * factor) as f32),
+            "renderer.to_pixels.weight" | "renderer.to_pixels.bias" => (1, 1.0),
+            _ => return None,
+        };
+        let [rows, columns] = match tensor.shape[..] {
             [rows, columns] => [rows, columns],
             [columns] => [1, columns],
             _ => return None,
@@ -124,11 +83,22 @@ impl NetworkAdapter {
         }
         let bytes = tensor.to_bytes().ok()?;
         let value = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().expect("four bytes"));
-        let layer = Values { shape, values: bytes.chunks_exact(4).map(value).collect() };
-        let layer = self.with_longer_patches(&tensor.name, layer);
-        let shape = Shape::from(layer.shape[2 - tensor.shape[..].len()..].to_vec());
-        let values = Bytes::from_elems(layer.values);
-        Some(PackTensor::new(tensor.name.clone(), DType::F32, shape, tensor.param_id, values))
+        let former: Vec<f32> = bytes.chunks_exact(4).map(value).collect();
+
+        // Every pixel of the longer patch takes the channels of the pixel of the former patch that it lies in.
+        let channels = [rows, columns][axis] / (patch_size * patch_size);
+        let side = 0..factor * patch_size;
+        let pixels = side.clone().flat_map(|y| side.clone().map(move |x| (y / factor) * patch_size + x / factor));
+        let sources: Vec<usize> = pixels.flat_map(|pixel| pixel * channels..(pixel + 1) * channels).collect();
+        let (rows, source): (usize, &dyn Fn(usize, usize) -> usize) = match axis {
+            0 => (sources.len(), &|row, column| sources[row] * columns + column),
+            _ => (rows, &|row, column| row * columns + sources[column]),
+        };
+        let columns = if axis == 0 { columns } else { sources.len() };
+        let values = (0..rows * columns).map(|i| former[source(i / columns, i % columns)] * scale).collect();
+        let shape = [rows, columns][2 - tensor.shape[..].len()..].to_vec();
+        let values = Bytes::from_elems::<f32>(values);
+        Some(PackTensor::new(tensor.name.clone(), DType::F32, Shape::from(shape), tensor.param_id, values))
     }
 }
 
@@ -165,34 +135,9 @@ impl ModuleMapper for CloseBlocks {
     }
 }
 
-/// A matrix, or a row.
-struct Values {
-    shape: [usize; 2],
-    values: Vec<f32>,
-}
-
-impl Values {
-    /// Takes the rows (`axis` 0) or columns of `sources`, times `scale`.
-    fn gather(self, axis: usize, sources: &[usize], scale: f32) -> Self {
-        let Self { shape: [_, old_columns], values } = self;
-        let mut shape = self.shape;
-        shape[axis] = sources.len();
-        let [rows, columns] = shape;
-        let source = |row: usize, column: usize| match axis {
-            0 => sources[row] * old_columns + column,
-            _ => row * old_columns + sources[column],
-        };
-        let values = (0..rows * columns).map(|i| values[source(i / columns, i % columns)] * scale).collect();
-        Self { shape, values }
-    }
-}
-
 impl ModuleAdapter for NetworkAdapter {
     fn adapt(&self, tensor: PackTensor, _context: ModuleContext<'_>) -> PackTensor {
-        if *self == Self::default() {
-            return tensor;
-        }
-        self.adapted(&tensor).unwrap_or(tensor)
+        self.with_longer_patches(&tensor).unwrap_or(tensor)
     }
 
     fn clone_box(&self) -> Box<dyn ModuleAdapter> {
@@ -202,9 +147,11 @@ impl ModuleAdapter for NetworkAdapter {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use burn::store::PathFilter;
     use burn::tensor::{Device, Tensor};
-    use clift_core::{Camera, ClipViews, DMat3, Intrinsics, Pose};
+    use clift_core::{Camera, DMat3, Intrinsics, Pose};
 
     use super::*;
     use crate::network::architecture::CameraEncoding;
@@ -213,10 +160,9 @@ mod tests {
     use crate::views::upload::{Cameras, Views};
     use crate::weights::file::{load_adapted, save_weights};
 
-    fn config(patch_size: usize, rays: RayFrame) -> ModelConfig {
+    fn config(patch_size: usize) -> ModelConfig {
         ModelConfig {
             camera_encoding: CameraEncoding::Gta,
-            rays,
             patch_size,
             dim: 16,
             num_heads: 2,
@@ -241,17 +187,9 @@ mod tests {
             intrinsics: Intrinsics { fx: 5e3 * size, fy: 6e3 * size, cx: 4.0 * size, cy: 2.0 * size },
         };
         let upload = |views: std::ops::Range<usize>| {
-            let views = ClipViews {
-                width,
-                height,
-                images: Vec::new(),
-                cameras: views.clone().map(camera).collect(),
-                frame_index: views.collect(),
-            };
-            Cameras::upload(&[&views], &device).expect("valid")
+            Cameras::of_views(&views.map(camera).collect::<Vec<_>>(), height, width, &device).expect("valid")
         };
-        let blocks = random([2, 4, 8 * 3], 5, &device).reshape([1, 2, 4, 1, 8, 3]).cast(DType::F32);
-        let images = blocks.reshape([1, 2, 4, 8, 3]);
+        let images = random([2, 4, 8 * 3], 5, &device).reshape([1, 2, 4, 8, 3]).cast(DType::F32);
         (Views { images: repeated(images, scale), cameras: upload(0..2) }, upload(2..3))
     }
 
@@ -265,68 +203,49 @@ mod tests {
     }
 
     #[test]
-    fn longer_patches_show_the_former_image_with_repeated_pixels() {
+    fn larger_networks_show_the_former_image_with_repeated_pixels() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
-        let short = Network::new(&config(2, RayFrame::World), 3, &Device::flex());
-        save_weights(&short, &path).unwrap();
-        let write = |text: &str| std::fs::write(folder.path().join("config.toml"), text).unwrap();
-        write(
-            "[model]\npatch_size = 2\ncamera_encoding = \"gta\"\ndim = 16\nnum_heads = 2\nfeed_forward_dim = 24\n\
-             num_encoder_blocks = 1\nnum_renderer_blocks = 1\n",
-        );
+        let former = Network::new(&config(2), 3, &Device::flex());
+        save_weights(&former, &path).unwrap();
+        let text = toml::to_string(&BTreeMap::from([("model", config(2))])).unwrap();
+        std::fs::write(folder.path().join("config.toml"), text).unwrap();
         let load = |config: &ModelConfig| {
             let mut network = Network::new(config, 4, &Device::flex());
             let adapter = NetworkAdapter::find(config, folder.path())?;
-            load_adapted(&mut network, &PathFilter::all(), &path, adapter)?.require_all(&path)?;
-            Ok::<_, ModelError>((network, adapter.describe()))
+            load_adapted(&mut network, &PathFilter::all(), &path, adapter)?;
+            Ok::<_, ModelError>((network, adapter))
         };
         let render = |network: &Network, scale: usize| {
             let (context, targets) = views(scale);
             network.render(network.encode(&context), &targets)
         };
-        let expected = render(&short, 1);
-        for (factor, description) in [(1, None), (2, Some("adapted to patches of 4 instead of 2 pixels"))] {
-            let (longer, described) = load(&config(2 * factor, RayFrame::World)).unwrap();
-            assert_close(&render(&longer, factor), &repeated(expected.clone(), factor), 1e-4);
-            assert_eq!(described.as_deref(), description);
+        let deeper = |patch_size| ModelConfig { num_encoder_blocks: 2, num_renderer_blocks: 3, ..config(patch_size) };
+        for (config, factor, description) in [
+            (config(2), 1, None),
+            (config(4), 2, Some("adapted to patches of 4 instead of 2 pixels")),
+            (deeper(2), 1, Some("adapted to more than 1 + 1 blocks")),
+            (deeper(4), 2, Some("adapted to patches of 4 instead of 2 pixels and more than 1 + 1 blocks")),
+        ] {
+            let (network, adapter) = load(&config).unwrap();
+            assert_eq!(adapter.describe().as_deref(), description);
+            let expected = repeated(render(&former, 1), factor);
+            let added = to_vec(render(&network, factor) - expected.clone());
+            let is_deeper = config.num_renderer_blocks > 1;
+            assert_eq!(added.iter().any(|difference| difference.abs() > 1e-3), is_deeper, "added blocks are open");
+            assert_close(&render(&adapter.close_added_blocks(network), factor), &expected, 1e-4);
         }
-        // Without moments the image is another one, near it.
-        let (of_cameras, described) = load(&config(4, RayFrame::Camera)).unwrap();
-        let difference = to_vec(render(&of_cameras, 2) - repeated(expected, 2));
-        assert!(difference.iter().all(|value| value.abs() < 0.2) && difference.iter().any(|value| value.abs() > 1e-4));
-        assert!(described.unwrap().ends_with("pixels and rays in the frame of the camera instead of the scene"));
-        let wrong = load(&config(3, RayFrame::World)).map(|_| ()).unwrap_err().to_string();
-        assert!(wrong.starts_with("`model.patch_size` = 3: the weights are of a network with 2"), "{wrong}");
-        // Weights with longer patches than their config says.
-        save_weights(&Network::new(&config(4, RayFrame::World), 3, &Device::flex()), &path).unwrap();
-        let other = load(&config(8, RayFrame::World)).map(|_| ()).unwrap_err().to_string();
-        assert!(other.contains(" is [") && other.contains(", expected ["), "{other}");
-        let wider = load(&ModelConfig { dim: 32, ..config(4, RayFrame::World) }).map(|_| ()).unwrap_err().to_string();
-        assert!(wider.starts_with("`model.dim` = 32"), "{wider}");
-    }
 
-    #[test]
-    fn deeper_networks_show_the_same_image() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("model.safetensors");
-        let shallow = Network::new(&config(2, RayFrame::World), 3, &Device::flex());
-        save_weights(&shallow, &path).unwrap();
-        let text = "[model]\npatch_size = 2\ncamera_encoding = \"gta\"\ndim = 16\nnum_heads = 2\nfeed_forward_dim = 24\n\
-                    num_encoder_blocks = 1\nnum_renderer_blocks = 1\n";
-        std::fs::write(folder.path().join("config.toml"), text).unwrap();
-        let deep = ModelConfig { num_encoder_blocks: 2, num_renderer_blocks: 3, ..config(2, RayFrame::World) };
-        let mut network = Network::new(&deep, 4, &Device::flex());
-        let adapter = NetworkAdapter::find(&deep, folder.path()).unwrap();
-        assert_eq!(adapter.describe().as_deref(), Some("adapted to more than 1 + 1 blocks"));
-        load_adapted(&mut network, &PathFilter::all(), &path, adapter).unwrap();
-        let (context, targets) = views(2);
-        let image = |network: &Network| network.render(network.encode(&context), &targets);
-        let open = to_vec(image(&network) - image(&shallow));
-        assert!(open.iter().any(|difference| difference.abs() > 1e-3));
-        assert_close(&image(&adapter.close_added_blocks(network)), &image(&shallow), 0.0);
-        let fewer = ModelConfig { num_encoder_blocks: 0, num_renderer_blocks: 3, ..config(2, RayFrame::World) };
-        let wrong = NetworkAdapter::find(&fewer, folder.path()).unwrap_err().to_string();
+        let refused = |config: &ModelConfig| load(config).map(|_| ()).unwrap_err().to_string();
+        let wrong = refused(&config(3));
+        assert!(wrong.starts_with("`model.patch_size` = 3: the weights are of a network with 2"), "{wrong}");
+        let wrong = refused(&ModelConfig { num_encoder_blocks: 0, ..deeper(2) });
         assert!(wrong.starts_with("`model.num_encoder_blocks` = 0: the weights are of a network with 1"), "{wrong}");
+        let wider = refused(&ModelConfig { dim: 32, ..config(4) });
+        assert!(wider.starts_with("`model.dim` = 32"), "{wider}");
+        // Weights with longer patches than their config says.
+        save_weights(&Network::new(&config(4), 3, &Device::flex()), &path).unwrap();
+        let other = refused(&config(8));
+        assert!(other.contains(" is [") && other.contains(", expected ["), "{other}");
     }
 }

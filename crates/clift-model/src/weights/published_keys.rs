@@ -14,7 +14,7 @@ pub const PREFIX: &str = "transformer.";
 pub const PERCEPTUAL_PREFIX: &str = "perceptual_loss.";
 
 /// Layers that are 1 x 1 convolutions in the published module, `[outputs, inputs, 1, 1]`; linear layers are read too.
-pub const PROJECTIONS: [&str; 3] = ["linear_input", "linear_target", "patch_to_image.0"];
+const PROJECTIONS: [&str; 3] = ["linear_input", "linear_target", "patch_to_image.0"];
 
 /// One tensor of a checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -114,72 +114,8 @@ fn published_key(path: &str) -> String {
     format!("{module}{layer}")
 }
 
-/// Returns a key in the form of [`PublishedTensor::key`]: without the segments that compiled and distributed models add,
-/// and with one name for the norms of queries and keys, whose published name is unknown.
+/// Returns a key in the form of [`PublishedTensor::key`]: without the segments that compiled and distributed models add.
 pub fn canonical_key(key: &str) -> String {
-    let mut parts: Vec<&str> = key.split('.').filter(|part| !matches!(*part, "_orig_mod" | "module")).collect();
-    if let [.., norm, last] = &mut parts[..] {
-        let known = match *norm {
-            "q_norm" | "norm_q" | "query_norm" | "qnorm" | "q_rms_norm" | "q_rmsnorm" | "q_layernorm" | "q_ln" => {
-                Some("q_norm")
-            }
-            "k_norm" | "norm_k" | "key_norm" | "knorm" | "k_rms_norm" | "k_rmsnorm" | "k_layernorm" | "k_ln" => {
-                Some("k_norm")
-            }
-            _ => None,
-        };
-        if let Some(known) = known {
-            *norm = known;
-            if matches!(*last, "gamma" | "scale" | "g") {
-                *last = "weight";
-            }
-        }
-    }
+    let parts: Vec<&str> = key.split('.').filter(|part| !matches!(*part, "_orig_mod" | "module")).collect();
     parts.join(".")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::network::architecture::CliftVariant;
-    use crate::network::config::CondenserConfig;
-    use crate::testing::small_config;
-
-    #[test]
-    fn parameter_counts_equal_the_published_ones() {
-        let count = |variant, condenser| {
-            let config = ModelConfig { variant, condenser: CondenserConfig::of(variant), ..ModelConfig::default() };
-            published_tensors(&config, condenser)
-                .iter()
-                .map(|tensor| tensor.shape.iter().product::<usize>())
-                .sum::<usize>()
-        };
-        assert_eq!(count(CliftVariant::ReleasedRe10k, false), 81_239_232); // 81.2 million
-        let condenser = count(CliftVariant::ReleasedRe10k, true) - count(CliftVariant::ReleasedRe10k, false);
-        assert_eq!(condenser, 8_468_480); // 8.5 million
-        // Two gammas of 96 in each of the 6 + 12 attentions of encoder and renderer, and a layer norm.
-        assert_eq!(
-            count(CliftVariant::ReleasedDl3dv, true) - count(CliftVariant::ReleasedRe10k, true),
-            18 * 2 * 96 + 2 * 768
-        );
-    }
-
-    #[test]
-    fn canonical_keys_lack_the_segments_of_wrappers() {
-        assert_eq!(canonical_key("_orig_mod.encoder.layers.0.norm1.weight"), "encoder.layers.0.norm1.weight");
-        assert_eq!(
-            canonical_key("encoder.layers.0.self_attn.query_norm.scale"),
-            "encoder.layers.0.self_attn.q_norm.weight"
-        );
-        assert_eq!(canonical_key("output_norm.weight"), "output_norm.weight");
-    }
-
-    #[test]
-    fn only_projections_may_be_convolutions() {
-        let all = published_tensors(&small_config(CliftVariant::ReleasedRe10k), true);
-        let fits = |key: &str, shape: &[u64]| all.iter().find(|tensor| tensor.key == key).expect("known").fits(shape);
-        assert!(fits("linear_input.weight", &[15, 576]) && fits("linear_input.weight", &[15, 576, 1, 1]));
-        assert!(!fits("linear_input.weight", &[15, 576, 1]) && !fits("linear_input.weight", &[15, 64, 3, 3]));
-        assert!(!fits("squeezer.linear1.weight", &[15, 15, 1, 1]) && !fits("linear_input.bias", &[15, 1, 1]));
-    }
 }

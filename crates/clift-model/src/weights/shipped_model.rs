@@ -25,9 +25,6 @@ pub fn is_shipped(path: &Path) -> bool {
 
 /// Returns a path that exists for one that [names the model inside the program](is_shipped): its files are written to the data
 /// folder of the user, unless they are there. Returns every other path as it is.
-///
-/// # Errors
-/// [`ModelError::NotUnpacked`] if the data folder cannot be written.
 pub fn find_shipped(path: &Path) -> Result<Cow<'_, Path>, ModelError> {
     if is_shipped(path) { unpack(&data_folder()).map(Cow::Owned) } else { Ok(Cow::Borrowed(path)) }
 }

@@ -37,7 +37,6 @@ impl EncoderModel<PRECISION> for Interval {
     }
 }
 
-/// The symbol of every quantile.
 struct Lookup<F>(F);
 
 impl<T, F: Fn(u32) -> (T, Interval)> EntropyModel<PRECISION> for Lookup<F> {
@@ -108,7 +107,6 @@ impl Decoder {
         (0..count).fold(0, |value, _| value << 1 | u32::from(self.next_bit()))
     }
 
-    /// Whether all symbols of the stream are decoded.
     pub fn is_finished(&self) -> bool {
         self.coder.is_empty()
     }
@@ -164,22 +162,6 @@ fn complement(taken: Interval) -> Interval {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn bits_and_intervals_come_back_in_order() {
-        let third = Interval { start: 100, size: TOTAL / 3 };
-        let mut encoder = Encoder::default();
-        encoder.push_bits(0b1011, 4);
-        encoder.push(third);
-        encoder.push_bits(u32::MAX, 31);
-        let mut decoder = Decoder::new(encoder.finish()).unwrap();
-        assert_eq!(decoder.next_bits(4), 0b1011);
-        assert!(decoder.next(|quantile| ((100..100 + TOTAL / 3).contains(&quantile), third)));
-        assert_eq!(decoder.next_bits(31), u32::MAX >> 1);
-        assert!(decoder.is_finished());
-        assert!(Decoder::new(vec![1, 0]).is_none(), "no encoder ends with a zero");
-        assert!(Decoder::new(Vec::new()).unwrap().is_finished());
-    }
 
     #[test]
     fn ids_take_the_bits_of_their_number_of_subsets() {

@@ -14,7 +14,7 @@ use crate::codec::prediction::{NUM_CLASSES, Prediction};
 use crate::codec::rates::RateTable;
 use crate::codec::token_codec::TokenCodec;
 use crate::codec::transform::Transform;
-use crate::tensors::Tensors;
+use crate::tensors::{Tensors, f32_bytes, f64_bytes};
 
 const FORMAT: &str = "clift-codec";
 const VERSION: &str = "2";
@@ -23,9 +23,6 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 
 impl TokenCodec {
     /// Makes the codec of a fitted transform.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for a codec that cannot be stored.
     pub fn new(
         (model, kind, renderer_hash): (ModelConfig, TokenKind, String),
         (transform, prediction): (Transform, Prediction),
@@ -39,10 +36,11 @@ impl TokenCodec {
             transform,
             prediction,
             distributions,
-            rates: rates.new()?,
+            rates: rates.checked()?,
             hash: String::new(),
         };
-        codec.hash = hash_of(&codec)?;
+        let bad = |fix| ModelError::BadConfig { key: "codec", value: codec.renderer_hash.clone(), fix };
+        codec.hash = hash(&to_bytes(&codec).map_err(bad)?);
         Ok(codec)
     }
 
@@ -63,10 +61,6 @@ impl TokenCodec {
     }
 
     /// Reads and checks a codec.
-    ///
-    /// # Errors
-    /// [`ModelError::NoCodec`] without the file, [`ModelError::CodecFile`] for a file that is not a codec, is damaged or
-    /// inconsistent.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         let size = match std::fs::metadata(path) {
             Ok(found) if found.is_file() => found.len(),
@@ -83,11 +77,6 @@ impl TokenCodec {
 }
 
 /// Returns the first 16 hexadecimal digits of the SHA-256 of a codec's file.
-fn hash_of(codec: &TokenCodec) -> Result<String, ModelError> {
-    let bad = |fix| ModelError::BadConfig { key: "codec", value: codec.renderer_hash.clone(), fix };
-    Ok(hash(&to_bytes(codec).map_err(bad)?))
-}
-
 fn hash(bytes: &[u8]) -> String {
     hex::encode(&Sha256::digest(bytes)[..8])
 }
@@ -96,8 +85,8 @@ fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
     let TokenCodec { model, kind, renderer_hash, transform, prediction, distributions, rates, .. } = codec;
     let (dim, knots) = (transform.mean.len(), distributions.knots.len());
     let (counts, steps) = (rates.shares.len(), rates.steps.len());
-    let f32s = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
-    let f64s = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+    let f32s = |values: &[f32]| f32_bytes(values.iter().copied());
+    let f64s = |values: &[f64]| f64_bytes(values.iter().copied());
     let tensors = [
         ("mean", Dtype::F32, vec![dim], f32s(&transform.mean)),
         ("basis", Dtype::F32, vec![dim, dim], f32s(&transform.basis)),
@@ -177,7 +166,7 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
         loss: f64s("rate_loss", &[counts, steps])?,
         psnr: f64s("rate_psnr", &[counts])?,
     };
-    let rates = rates.new().map_err(|error| error.to_string())?;
+    let rates = rates.checked().map_err(|error| error.to_string())?;
     let renderer_hash = field("renderer")?.clone();
     Ok(TokenCodec { model, kind, renderer_hash, transform, prediction, distributions, rates, hash: hash(bytes) })
 }

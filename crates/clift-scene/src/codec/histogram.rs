@@ -9,7 +9,6 @@ const KNOTS_PER_SIDE: usize = 41;
 /// Share of an even distribution over the bins: a value of no training scene has a probability, too.
 const EVEN_SHARE: f64 = 1e-4;
 
-/// Cumulative distributions of coefficients.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Distributions {
     /// Ascending, in standard deviations, `[K]`.
@@ -27,7 +26,6 @@ pub struct Histograms {
 }
 
 impl Histograms {
-    /// Starts with no coefficients of `dim` directions.
     pub fn new(dim: usize) -> Self {
         let side = |k: usize| (k as f64 / 4.0 - 5.0).exp2() as f32;
         let knots: Vec<f32> =
@@ -40,7 +38,7 @@ impl Histograms {
         let (dim, bins) = (transform.mean.len(), self.knots.len() - 1);
         let weight = dim as f64 / tokens.len() as f64;
         let (values, neighbours) = places.sorted(&transform.forward(tokens), dim);
-        for (token, (class, nearest)) in neighbours.iter().enumerate() {
+        for (token, (class, nearest)) in neighbours.into_iter().enumerate() {
             for (d, &deviation) in transform.deviations.iter().enumerate() {
                 let [first, second] = nearest.map(|token| f64::from(values[token * dim + d]));
                 let expected = prediction.value(class, d, [first, second]);
@@ -52,7 +50,6 @@ impl Histograms {
         }
     }
 
-    /// Returns the distributions of all tokens.
     pub fn distributions(&self) -> Distributions {
         let bins = self.knots.len() - 1;
         let mut cumulative = Vec::with_capacity(self.weights.len() / bins * self.knots.len());

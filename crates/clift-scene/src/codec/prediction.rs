@@ -40,63 +40,45 @@ impl Places<'_> {
         let order = self.order();
         let ids: Vec<u32> = order.iter().map(|&token| self.ids[token]).collect();
         let rows = order.iter().flat_map(|&token| &rows[token * dim..(token + 1) * dim]).copied().collect();
-        (rows, Neighbours::new(&ids, self.grid))
+        (rows, neighbours(&ids, self.grid))
     }
 }
 
-/// The two nearest earlier tokens of every token.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Neighbours {
-    /// Class of every token, and its neighbours: both the same if there is one, the token itself if there is none.
-    of_token: Vec<(usize, [usize; 2])>,
-}
+/// Class of every token, and its two nearest earlier tokens: both the same if there is one, the token itself if there is none.
+pub(crate) type Neighbours = Vec<(usize, [usize; 2])>;
 
-impl Neighbours {
-    /// Finds the neighbours of tokens with ascending ids. Of equally near ones, the later is nearer.
-    pub fn new(ids: &[u32], [_, rows, columns]: [usize; 3]) -> Self {
-        let place = |id: u32| {
-            let id = id as usize;
-            [id / (rows * columns), id / columns % rows, id % columns]
-        };
-        let mut of_token = Vec::with_capacity(ids.len());
-        for (token, &id) in ids.iter().enumerate() {
-            let [view, row, column] = place(id);
-            let mut nearest = [(usize::MAX, token); 2];
-            for earlier in (0..token).rev() {
-                let [other, r, c] = place(ids[earlier]);
-                let below = (row - r.min(row)).pow(2);
-                if other != view || below > nearest[1].0 {
-                    break;
-                }
-                let distance = below + column.abs_diff(c).pow(2);
-                if distance < nearest[0].0 {
-                    nearest = [(distance, earlier), nearest[0]];
-                } else if distance < nearest[1].0 {
-                    nearest[1] = (distance, earlier);
-                }
+/// Finds the neighbours of tokens with ascending ids. Of equally near ones, the later is nearer.
+pub(crate) fn neighbours(ids: &[u32], [_, rows, columns]: [usize; 3]) -> Neighbours {
+    let place = |id: u32| {
+        let id = id as usize;
+        [id / (rows * columns), id / columns % rows, id % columns]
+    };
+    let of_token = |(token, &id): (usize, &u32)| {
+        let [view, row, column] = place(id);
+        let mut nearest = [(usize::MAX, token); 2];
+        for earlier in (0..token).rev() {
+            let [other, r, c] = place(ids[earlier]);
+            let below = (row - r.min(row)).pow(2);
+            if other != view || below > nearest[1].0 {
+                break;
             }
-            let [(distance, first), (_, second)] = nearest;
-            let class = match distance {
-                usize::MAX => NUM_CLASSES - 1,
-                _ => LIMITS.iter().position(|limit| distance <= *limit as usize).unwrap_or(LIMITS.len()),
-            };
-            of_token.push((class, [first, if second == token { first } else { second }]));
+            let distance = below + column.abs_diff(c).pow(2);
+            if distance < nearest[0].0 {
+                nearest = [(distance, earlier), nearest[0]];
+            } else if distance < nearest[1].0 {
+                nearest[1] = (distance, earlier);
+            }
         }
-        Self { of_token }
-    }
-
-    /// Returns the class and the neighbours of every token; the first of a view has itself.
-    pub fn iter(&self) -> impl Iterator<Item = (usize, [usize; 2])> {
-        self.of_token.iter().copied()
-    }
-
-    /// Whether a token is of this class.
-    pub fn has(&self, class: usize) -> bool {
-        self.of_token.iter().any(|(found, _)| *found == class)
-    }
+        let [(distance, first), (_, second)] = nearest;
+        let class = match distance {
+            usize::MAX => NUM_CLASSES - 1,
+            _ => LIMITS.iter().position(|limit| distance <= *limit as usize).unwrap_or(LIMITS.len()),
+        };
+        (class, [first, if second == token { first } else { second }])
+    };
+    ids.iter().enumerate().map(of_token).collect()
 }
 
-/// Weights of the neighbours and deviations from the expected values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
     /// Weights of the nearest and of the second nearest earlier token, `[C, D, 2]`.
@@ -151,17 +133,15 @@ pub struct NeighbourProducts {
 }
 
 impl NeighbourProducts {
-    /// Starts with no tokens of width `dim`.
     pub fn new(dim: usize) -> Self {
         Self { sums: vec![[0.0; 7]; NUM_CLASSES * dim], dim }
     }
 
-    /// Adds the tokens of a scene, `[S, D]`.
     pub fn add(&mut self, transform: &Transform, tokens: &[f32], places: Places<'_>) {
         let dim = self.dim;
         let (values, neighbours) = places.sorted(&transform.forward(tokens), dim);
         let weight = dim as f64 / tokens.len() as f64;
-        for (token, (class, [first, second])) in neighbours.iter().enumerate() {
+        for (token, (class, [first, second])) in neighbours.into_iter().enumerate() {
             for direction in 0..dim {
                 let [x, a, b] = [token, first, second].map(|token| f64::from(values[token * dim + direction]));
                 let sums = &mut self.sums[class * dim + direction];
@@ -204,29 +184,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbours_are_the_nearest_earlier_tokens_of_the_view() {
-        // Two views of 4 x 5 patches.
-        let ids = [0, 1, 4, 7, 11, 19, 20, 38];
-        let found: Vec<_> = Neighbours::new(&ids, [2, 4, 5]).iter().collect();
-        let (none, far) = (NUM_CLASSES - 1, LIMITS.len());
-        let expected = [
-            (none, [0, 0]),
-            (0, [0, 0]),
-            (3, [1, 0]),
-            (1, [1, 2]), // row 1, column 2: below the one, as far from 0 as from 2
-            (1, [3, 1]), // row 2, column 1
-            (3, [3, 2]), // row 3, column 4
-            (none, [6, 6]),
-            (far, [6, 6]),
-        ];
-        assert_eq!(found, expected);
-    }
-
-    #[test]
     fn all_pairs_give_the_same_neighbours() {
         let ids: Vec<u32> = (0..120).filter(|id| (id * id) % 7 < 3).collect();
-        let found = Neighbours::new(&ids, [2, 6, 10]);
-        for (token, (_, nearest)) in found.iter().enumerate() {
+        let found = neighbours(&ids, [2, 6, 10]);
+        for (token, (_, nearest)) in found.into_iter().enumerate() {
             let place = |token: usize| [ids[token] / 60, ids[token] / 10 % 6, ids[token] % 10].map(i64::from);
             let [view, row, column] = place(token);
             let mut earlier: Vec<(i64, std::cmp::Reverse<usize>)> = (0..token)

@@ -3,7 +3,6 @@
 
 use clift_model::ModelError;
 
-/// Measured rates and losses, and rules that choose count and step by them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RateTable {
     /// Ascending shares of all tokens, `[C]`.
@@ -26,24 +25,13 @@ const SEARCH_STEPS: usize = 60;
 
 impl RateTable {
     /// Makes losses positive and ascending with the step: means over few views can be a little off.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for tables that are empty, unordered, of other sizes, or not finite.
-    pub fn new(mut self) -> Result<Self, ModelError> {
+    pub fn checked(mut self) -> Result<Self, ModelError> {
         let (counts, steps) = (self.shares.len(), self.steps.len());
-        let ascending = |values: &[f64]| values.windows(2).all(|pair| pair[0] < pair[1]);
+        let ascending = |values: &[f64]| values[0] > 0.0 && values.windows(2).all(|pair| pair[0] < pair[1]);
         let sizes = [self.bits.len(), self.loss.len(), self.psnr.len()] == [counts * steps, counts * steps, counts];
         let all = [&self.shares, &self.steps, &self.bits, &self.loss, &self.psnr];
         let is_finite = all.iter().all(|values| values.iter().all(|value| value.is_finite()));
-        let is_positive = self.shares.iter().chain(&self.steps).all(|value| *value > 0.0);
-        if counts == 0
-            || steps < 2
-            || !sizes
-            || !is_finite
-            || !is_positive
-            || !ascending(&self.shares)
-            || !ascending(&self.steps)
-        {
+        if counts == 0 || steps < 2 || !sizes || !is_finite || !ascending(&self.shares) || !ascending(&self.steps) {
             let value = format!("{counts} counts and {steps} steps");
             return Err(ModelError::BadConfig { key: "rates", value, fix: "fit the codec again".into() });
         }
@@ -57,51 +45,19 @@ impl RateTable {
         Ok(self)
     }
 
-    /// Returns the expected loss in dB.
     pub fn loss(&self, share: f64, step: f64) -> f64 {
         let logs: Vec<f64> = self.loss.iter().map(|loss| loss.ln()).collect();
         self.at(&logs, share, step).exp()
     }
 
-    /// Returns the expected bits per token.
-    pub fn bits(&self, share: f64, step: f64) -> f64 {
-        self.at(&self.bits, share, step).max(0.0)
-    }
-
     /// Returns the largest step with at most `loss_db` of expected loss.
     pub fn step_for_loss(&self, share: f64, loss_db: f64) -> f64 {
-        self.boundary(|step| self.loss(share, step) <= loss_db)[0]
-    }
-
-    /// Returns the share of tokens of the highest expected PSNR whose `num_patches` times share tokens take `bytes`.
-    pub fn share_for_bytes(&self, num_patches: usize, bytes: f64) -> f64 {
-        let quality = |(share, psnr): (&f64, &f64)| {
-            let bits = bytes * 8.0 / (num_patches as f64 * share).max(1.0);
-            let coarsest = self.steps[self.steps.len() - 1];
-            if self.bits(*share, coarsest) > bits {
-                return f64::NEG_INFINITY; // beyond what was measured
-            }
-            let [_, finest] = self.boundary(|step| self.bits(*share, step) > bits);
-            psnr - self.loss(*share, finest)
-        };
-        let qualities: Vec<f64> = self.shares.iter().zip(&self.psnr).map(quality).collect();
-        let best = (0..qualities.len()).max_by(|&a, &b| qualities[a].total_cmp(&qualities[b])).unwrap_or_default();
-        if qualities[best] == f64::NEG_INFINITY { self.shares[0] } else { self.shares[best] }
-    }
-
-    /// Returns steps beyond every step that is worth a try.
-    pub fn step_range(&self) -> [f64; 2] {
-        [self.steps[0] / STEP_MARGIN, self.steps[self.steps.len() - 1] * STEP_MARGIN]
-    }
-
-    /// Returns steps close to each other, of which `is_low` holds for the first and not for the second.
-    fn boundary(&self, is_low: impl Fn(f64) -> bool) -> [f64; 2] {
-        let [mut low, mut high] = self.step_range();
+        let (mut low, mut high) = (self.steps[0] / STEP_MARGIN, self.steps[self.steps.len() - 1] * STEP_MARGIN);
         for _ in 0..SEARCH_STEPS {
             let middle = (low * high).sqrt();
-            *(if is_low(middle) { &mut low } else { &mut high }) = middle;
+            *(if self.loss(share, middle) <= loss_db { &mut low } else { &mut high }) = middle;
         }
-        [low, high]
+        low
     }
 
     /// Interpolates in the logarithms of share and step; beyond the steps the line goes on, beyond the shares it is constant.
@@ -136,27 +92,23 @@ pub(crate) mod tests {
             loss: vec![0.01, 0.04, 0.16, 0.02, 0.08, 0.32],
             psnr: vec![20.0, 21.0],
         }
-        .new()
+        .checked()
         .unwrap()
     }
 
     #[test]
-    fn steps_follow_from_losses_and_shares_from_bytes() {
+    fn steps_follow_from_losses() {
         let rates = rates();
         let near = |got: f64, expected: f64| (got / expected - 1.0).abs() < 1e-6;
         assert!(near(rates.step_for_loss(0.5, 0.04), 1.0));
         assert!(near(rates.step_for_loss(1.0, 0.005), 0.25), "the loss goes on below the finest step");
         assert!(near(rates.step_for_loss(0.01, 0.04), 1.0), "few tokens count as the fewest measured");
         assert!(near(rates.loss(0.5_f64.sqrt(), 1.0), (0.04_f64 * 0.08).sqrt()));
-        assert!(near(rates.bits(1.0, 2_f64.sqrt()), 5.0) && rates.bits(1.0, 9.0) == 0.0);
-        assert_eq!(rates.share_for_bytes(80, 100.0), 1.0, "80 tokens of 10 bits lose 0.08 dB, half of them 1 dB");
-        let few = RateTable { psnr: vec![21.0, 20.0], ..rates.clone() };
-        assert_eq!(few.share_for_bytes(80, 100.0), 0.5);
     }
 
     #[test]
     fn losses_ascend_and_other_tables_are_refused() {
-        let noisy = RateTable { loss: vec![-0.01, 0.03, 0.02, 0.0, 0.0, 0.0], ..rates() }.new().unwrap();
+        let noisy = RateTable { loss: vec![-0.01, 0.03, 0.02, 0.0, 0.0, 0.0], ..rates() }.checked().unwrap();
         assert!(noisy.loss.chunks(3).all(|loss| loss[0] > 0.0 && loss[0] < loss[1] && loss[1] < loss[2]), "{noisy:?}");
         for broken in [
             RateTable { steps: vec![1.0, 0.5, 2.0], ..rates() },
@@ -164,7 +116,7 @@ pub(crate) mod tests {
             RateTable { bits: vec![f64::NAN; 6], ..rates() },
             RateTable { shares: vec![0.0, 1.0], ..rates() },
         ] {
-            assert!(broken.new().is_err());
+            assert!(broken.checked().is_err());
         }
     }
 }

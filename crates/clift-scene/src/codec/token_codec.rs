@@ -1,21 +1,19 @@
 //! The codec of a model: tokens to words and back.
 // N patches of the context views, S tokens, D width
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use clift_model::{ModelConfig, ModelError, TokenKind, TrainedModel};
 
 use crate::codec::entropy::{Decoder, Encoder, decode_ids, encode_ids};
 use crate::codec::histogram::Distributions;
-use crate::codec::prediction::{NUM_CLASSES, Neighbours, Places, Prediction};
+use crate::codec::prediction::{NUM_CLASSES, Neighbours, Places, Prediction, neighbours};
 use crate::codec::rates::RateTable;
 use crate::codec::table::{MIN_BITS, Table};
 use crate::codec::transform::Transform;
 
 /// Squared steps that a bit is worth: the slope of distortion against rate of a fine uniform quantizer, `2 ln 2 / 12`.
 const BIT_VALUE: f32 = 0.1155;
-/// Largest magnitude of a level.
 const MAX_LEVEL: f32 = (1 << 30) as f32;
 /// Most values that coded tokens may have: as many as the largest plain file has in f32.
 const MAX_VALUES: f64 = (1 << 28) as f64;
@@ -41,38 +39,8 @@ pub struct TokenCodec {
     pub hash: String,
 }
 
-/// Tokens as integers, in the order of their ids.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Levels {
-    /// Of every direction the levels of all tokens, `[D][S]`.
-    pub of_direction: Vec<Vec<i32>>,
-    pub num_tokens: usize,
-}
-
-/// Counts of the deviations of levels from the expected ones, of every direction and class of neighbours.
-#[derive(Clone, Debug, Default)]
-pub struct LevelCounts(BTreeMap<((usize, usize), i32), u64>);
-
-impl LevelCounts {
-    /// Returns the bits of all counted deviations by their entropy, the bound of every coder that knows the direction and
-    /// the class alone.
-    pub fn entropy_bits(&self) -> f64 {
-        let mut totals = BTreeMap::<(usize, usize), u64>::new();
-        for (&(known, _), count) in &self.0 {
-            *totals.entry(known).or_default() += count;
-        }
-        let bits = |(&(known, _), &count): (&((usize, usize), i32), &u64)| {
-            count as f64 * (totals[&known] as f64 / count as f64).log2()
-        };
-        self.0.iter().map(bits).sum()
-    }
-}
-
 impl TokenCodec {
     /// Reads the codec beside the weights of a model; `None` without a codec.
-    ///
-    /// # Errors
-    /// As [`read`](Self::read), and [`ModelError::CodecFile`] for a codec of other weights.
     pub fn beside(weights: &Path, model: &TrainedModel) -> Result<Option<Self>, ModelError> {
         let path = Self::path_of(weights);
         if !path.exists() {
@@ -87,12 +55,10 @@ impl TokenCodec {
     }
 
     /// Rounds tokens `[S, D]` to coefficients of whole `step`s, as writing and reading a file does.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for a step that is not positive, or too small for the tokens.
     pub fn round(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<Vec<f32>, ModelError> {
         let levels = self.quantize(tokens, places, step)?.0;
-        let (dim, sorted) = (self.transform.mean.len(), self.dequantize(&levels, step));
+        let dim = self.transform.mean.len();
+        let sorted = self.transform.inverse(&levels, step, tokens.len() / dim);
         let mut rounded = vec![0.0; tokens.len()];
         for (row, token) in sorted.chunks_exact(dim).zip(places.order()) {
             rounded[token * dim..(token + 1) * dim].copy_from_slice(row);
@@ -100,41 +66,37 @@ impl TokenCodec {
         Ok(rounded)
     }
 
-    /// Returns the bits of tokens `[S, D]` in a stream of their own, and counts their levels.
-    pub fn count_bits(
-        &self,
-        tokens: &[f32],
-        places: Places<'_>,
-        step: f32,
-        counts: &mut LevelCounts,
-    ) -> Result<f64, ModelError> {
-        let (levels, neighbours) = self.quantize(tokens, places, step)?;
+    /// Returns the bits of tokens `[S, D]` in a stream of their own.
+    pub(crate) fn stream_bits(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<f64, ModelError> {
         let mut encoder = Encoder::default();
-        self.for_each_deviation(&levels, &neighbours, step, |known, deviation, table| {
-            *counts.0.entry((known, deviation)).or_default() += 1;
-            table.encode(deviation, &mut encoder);
-        });
+        self.encode_levels(tokens, places, step, &mut encoder)?;
         Ok(encoder.finish().len() as f64 * 32.0)
     }
 
     /// Encodes tokens `[S, D]` and their places, in the order of ids.
     pub fn encode(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<Vec<u32>, ModelError> {
-        let (levels, neighbours) = self.quantize(tokens, places, step)?;
         let mut ids = places.ids.to_vec();
         ids.sort_unstable();
         let mut encoder = Encoder::default();
         encode_ids(&mut encoder, &ids, places.grid.iter().product());
-        self.for_each_deviation(&levels, &neighbours, step, |_, deviation, table| {
-            table.encode(deviation, &mut encoder);
-        });
+        self.encode_levels(tokens, places, step, &mut encoder)?;
         Ok(encoder.finish())
+    }
+
+    fn encode_levels(
+        &self,
+        tokens: &[f32],
+        places: Places<'_>,
+        step: f32,
+        encoder: &mut Encoder,
+    ) -> Result<(), ModelError> {
+        let (levels, neighbours) = self.quantize(tokens, places, step)?;
+        self.for_each_deviation(&levels, &neighbours, step, |_, deviation, table| table.encode(deviation, encoder));
+        Ok(())
     }
 
     /// Decodes tokens and their ids on a `grid` of views, rows and columns. Words may be damaged or hostile: memory is
     /// bounded by their number, and by `MAX_VALUES`.
-    ///
-    /// # Errors
-    /// The problem of words that no encoder writes.
     pub fn decode(
         &self,
         words: Vec<u32>,
@@ -158,11 +120,11 @@ impl TokenCodec {
         let mut decoder = Decoder::new(words).ok_or("the last word of the tokens is 0")?;
         let ids = decode_ids(&mut decoder, num_tokens, num_patches);
         let mut of_direction = Vec::with_capacity(dim);
-        let neighbours = Neighbours::new(&ids, grid);
+        let neighbours = neighbours(&ids, grid);
         for direction in 0..dim {
             let tables = self.tables(direction, &neighbours, step);
             let mut levels = vec![0; num_tokens];
-            for (token, (class, nearest)) in neighbours.iter().enumerate() {
+            for (token, &(class, nearest)) in neighbours.iter().enumerate() {
                 let expected = self.prediction.level(class, direction, nearest.map(|token| levels[token]));
                 let level = tables[class].decode(&mut decoder).and_then(|deviation| deviation.checked_add(expected));
                 levels[token] = level.ok_or("a coded value has more bits than any value")?;
@@ -172,22 +134,29 @@ impl TokenCodec {
         if !decoder.is_finished() {
             return Err("words are left after the last token".into());
         }
-        Ok((ids, self.dequantize(&Levels { of_direction, num_tokens }, step)))
+        Ok((ids, self.transform.inverse(&of_direction, step, num_tokens)))
     }
 
     /// Returns the table of every class; an empty one for a class without tokens.
-    fn tables(&self, direction: usize, neighbours: &Neighbours, step: f32) -> [Table; NUM_CLASSES] {
+    fn tables(&self, direction: usize, neighbours: &[(usize, [usize; 2])], step: f32) -> [Table; NUM_CLASSES] {
         let Distributions { knots, cumulative } = &self.distributions;
         let cumulative = &cumulative[direction * knots.len()..][..knots.len()];
         let step = f64::from(step) / f64::from(self.transform.deviations[direction]);
         std::array::from_fn(|class| {
             let deviation = self.prediction.deviation(class, direction, step);
-            if neighbours.has(class) { Table::new(knots, cumulative, step / deviation) } else { Table::default() }
+            let has_class = neighbours.iter().any(|(found, _)| *found == class);
+            if has_class { Table::new(knots, cumulative, step / deviation) } else { Table::default() }
         })
     }
 
-    /// Rounds every coefficient to the level of the least cost: squared error, and bits at [`BIT_VALUE`].
-    fn quantize(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<(Levels, Neighbours), ModelError> {
+    /// Rounds every coefficient to the level of the least cost: squared error, and bits at [`BIT_VALUE`]. Returns the levels of
+    /// all tokens, in the order of their ids, of every direction, `[D][S]`.
+    fn quantize(
+        &self,
+        tokens: &[f32],
+        places: Places<'_>,
+        step: f32,
+    ) -> Result<(Vec<Vec<i32>>, Neighbours), ModelError> {
         let bad = |fix| ModelError::BadConfig { key: "step", value: step.to_string(), fix };
         check_step(step).map_err(|reason| bad(format!("{reason}; write a positive number")))?;
         let dim = self.transform.mean.len();
@@ -197,7 +166,7 @@ impl TokenCodec {
         for direction in 0..dim {
             let tables = self.tables(direction, &neighbours, step);
             let mut levels = vec![0; num_tokens];
-            for (token, (class, nearest)) in neighbours.iter().enumerate() {
+            for (token, &(class, nearest)) in neighbours.iter().enumerate() {
                 let value = coefficients[token * dim + direction] / step;
                 // A coefficient may be NaN after an overflow.
                 if value.is_nan() || value.abs() >= MAX_LEVEL {
@@ -210,24 +179,20 @@ impl TokenCodec {
             }
             of_direction.push(levels);
         }
-        Ok((Levels { of_direction, num_tokens }, neighbours))
-    }
-
-    fn dequantize(&self, levels: &Levels, step: f32) -> Vec<f32> {
-        self.transform.inverse(&levels.of_direction, step, levels.num_tokens)
+        Ok((of_direction, neighbours))
     }
 
     /// Calls `code` with direction and class, deviation from the expected level, and table of every level.
     fn for_each_deviation(
         &self,
-        levels: &Levels,
-        neighbours: &Neighbours,
+        levels: &[Vec<i32>],
+        neighbours: &[(usize, [usize; 2])],
         step: f32,
         mut code: impl FnMut((usize, usize), i32, &Table),
     ) {
-        for (direction, levels) in levels.of_direction.iter().enumerate() {
+        for (direction, levels) in levels.iter().enumerate() {
             let tables = self.tables(direction, neighbours, step);
-            for (level, (class, nearest)) in levels.iter().zip(neighbours.iter()) {
+            for (level, &(class, nearest)) in levels.iter().zip(neighbours) {
                 let expected = self.prediction.level(class, direction, nearest.map(|token| levels[token]));
                 code((direction, class), level - expected, &tables[class]);
             }

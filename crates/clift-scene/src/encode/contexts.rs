@@ -1,13 +1,13 @@
 //! The context views of a scene: requested frames, frames along the camera path, or groups of neighbours.
+//!
+//! A group is encoded as views were in training: views far apart, encoded together, come out as fog.
 
 use std::collections::BTreeSet;
 
-use clift_core::{Pose, PoseNormalization, ViewDistance, median};
-use clift_data::{ClipReader, DataError, contexts_along_path};
-use clift_model::{ModelError, TokenCount};
+use clift_core::{Pose, PoseNormalization, ViewDistance};
+use clift_data::{ClipReader, DataError, ViewSampler, contexts_along_path};
+use clift_model::{Grouping, KMeans, ModelConfig, ModelError, TokenCount};
 
-use crate::encode::groups::{neighbour_groups, neighbour_partition};
-use crate::encode::options::{ContextChoice, EncodeOptions};
 use crate::error::SceneError;
 use crate::scene::scene::ContextGroup;
 
@@ -17,6 +17,71 @@ const MAX_VIEWS: usize = 128;
 const GROUPS_PER_VIEW: f64 = 0.75;
 /// Fewest stored tokens of a group, by default.
 const MIN_TOKENS: usize = 32;
+
+/// Settings of [`encode`](crate::encode).
+#[derive(Clone, Debug, PartialEq)]
+pub struct EncodeOptions {
+    /// Context views and their groups.
+    pub context: ContextChoice,
+    /// One frame of this many is held out: it is not a context view. 0 for none.
+    pub hold_out: usize,
+    /// Number of stored tokens of all groups; `None` for a quarter (of many groups down to an eighth), or for all tokens of a
+    /// network without clusters.
+    pub stored_tokens: Option<TokenCount>,
+    /// Token groups that the model was trained on.
+    pub grouping: Grouping,
+    /// Latent K-means.
+    pub kmeans: KMeans,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Path of the model for the scene file, see [`Scene::model_path_for`](crate::Scene::model_path_for).
+    pub model_path: String,
+}
+
+impl Default for EncodeOptions {
+    /// The options for the default config of a run.
+    fn default() -> Self {
+        Self {
+            context: ContextChoice::Spread(ViewSampler::default().max_context),
+            hold_out: 0,
+            stored_tokens: None,
+            grouping: Grouping::default(),
+            kmeans: KMeans::default(),
+            seed: 0,
+            model_path: String::new(),
+        }
+    }
+}
+
+/// The context views of a scene, and which of them are encoded together.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ContextChoice {
+    /// These frames, encoded together.
+    Frames(Vec<usize>),
+    /// A number of frames at equal distances along the camera path, or all frames of a shorter path, encoded together.
+    Spread(usize),
+    /// A frame and those nearest to it, encoded together.
+    Near {
+        /// The frame.
+        frame: usize,
+        /// Number of views with the frame.
+        num_views: usize,
+    },
+    /// All frames, or 128 along a longer path, in overlapping groups of neighbours: three for every four views, and more if
+    /// these leave a view out; fewer, which leave views out, if a number of stored tokens is less than 32 a group.
+    Neighbours {
+        /// Views of a group.
+        num_views: usize,
+    },
+}
+
+impl ContextChoice {
+    /// Returns the choice for a captured scene and a network that was trained with up to `num_views` views: groups of
+    /// neighbours; of learned tokens, which have no place, views along the path.
+    pub fn for_capture(model: &ModelConfig, num_views: usize) -> Self {
+        if model.has_patch_tokens() { Self::Neighbours { num_views } } else { Self::Spread(num_views) }
+    }
+}
 
 /// The context views of a scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,10 +96,6 @@ pub struct Contexts {
 
 impl Contexts {
     /// Returns the context views that [`encode`](crate::encode) chooses.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for frames that the scene does not have, those of the cameras, and
-    /// [`CameraError::ZeroBaseline`](clift_core::CameraError::ZeroBaseline) for frames without a scale.
     pub fn choose(reader: &ClipReader, scene: usize, options: &EncodeOptions) -> Result<Self, SceneError> {
         let (key, data) = (reader.source.key(scene), &reader.options);
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
@@ -47,15 +108,13 @@ impl Contexts {
             PoseNormalization::find(key, views, &[], data.pose_rotation, data.pose_scale).map_err(DataError::from)
         };
         let of_frames = |frames: &[usize]| frames.iter().map(|&frame| poses[frame]).collect::<Vec<_>>();
-        let ContextChoice::Neighbours { num_views, num_groups, joined } = options.context else {
+        let ContextChoice::Neighbours { num_views } = options.context else {
             let normalization = find(&of_frames(&frames))?;
             return Ok(Self { groups: vec![ContextGroup::of_all(frames.len())], frames, normalization });
         };
-        let groups = match num_groups.or(most_groups(options.stored_tokens, frames.len())) {
-            _ if joined => neighbour_partition(&of_frames(&frames), num_views),
-            Some(count) => neighbour_groups(&of_frames(&frames), num_views, count, false),
-            None => neighbour_groups(&of_frames(&frames), num_views, default_groups(frames.len()), true),
-        };
+        let few = most_groups(options.stored_tokens, frames.len());
+        let count = few.unwrap_or(default_groups(frames.len()));
+        let groups = neighbour_groups(&of_frames(&frames), num_views, count, few.is_none());
         // The members of the groups alone are context views.
         let members: BTreeSet<usize> = groups.iter().flatten().copied().collect();
         let position = |view: &usize| members.range(..view).count() as u32;
@@ -69,18 +128,7 @@ impl Contexts {
             let frame = find(&poses).unwrap_or(PoseNormalization { mean_c2w: poses[0], scale: 1.0 });
             ContextGroup { views, frame }
         });
-        let contexts = Self { groups: groups.collect(), frames, normalization };
-        Ok(if joined { contexts.with_shared_frame() } else { contexts })
-    }
-
-    /// Gives all groups one frame, whose scale is the median of theirs.
-    fn with_shared_frame(mut self) -> Self {
-        let scales: Vec<f64> = self.groups.iter().map(|group| group.frame.scale).collect();
-        self.normalization.scale *= median(&scales);
-        for group in &mut self.groups {
-            group.frame = ContextGroup::of_all(0).frame;
-        }
-        self
+        Ok(Self { groups: groups.collect(), frames, normalization })
     }
 
     /// Returns the number of members of all groups.
@@ -107,11 +155,8 @@ fn choose_frames(poses: &[Pose], choice: &ContextChoice, held_out: &[usize]) -> 
     let kept_poses: Vec<Pose> = kept.iter().map(|&frame| poses[frame]).collect();
     let spread = |num_views: usize| {
         contexts_along_path(&kept_poses, num_views.min(kept.len())).ok_or_else(|| {
-            bad(
-                "--context",
-                num_views.to_string(),
-                format!("the scene has {num_frames} frames; list the frames to use"),
-            )
+            let fix = format!("the scene has {num_frames} frames; list the frames to use");
+            bad("--context", num_views.to_string(), fix)
         })
     };
     let no_frame =
@@ -138,9 +183,6 @@ fn choose_frames(poses: &[Pose], choice: &ContextChoice, held_out: &[usize]) -> 
             ViewDistance::new(&kept_poses).nearest(&kept_poses, position, num_views)
         }
         ContextChoice::Spread(num_views) => spread(num_views)?,
-        ContextChoice::Neighbours { num_views, num_groups: Some(count), joined: true } => {
-            spread(MAX_VIEWS.min(num_views.saturating_mul(count)))?
-        }
         ContextChoice::Neighbours { .. } => spread(MAX_VIEWS)?,
     };
     Ok(positions.into_iter().map(|position| kept[position]).collect())
@@ -150,46 +192,82 @@ fn bad(key: &'static str, value: String, fix: String) -> SceneError {
     ModelError::BadConfig { key, value, fix }.into()
 }
 
+/// Chooses `num_groups` groups of `num_views` neighbours, in ascending order each. Groups overlap. If `all` views must be
+/// members, there are more than `num_groups` where these leave a view out.
+///
+/// A group is a seed with the views nearest to it. The next seed is the view farthest from all seeds, among the views in no
+/// group as long as there are any.
+pub(crate) fn neighbour_groups(views: &[Pose], num_views: usize, num_groups: usize, all: bool) -> Vec<Vec<usize>> {
+    let distance = ViewDistance::new(views);
+    let mut to_seeds = vec![f64::INFINITY; views.len()];
+    let mut is_left_out = vec![true; views.len()];
+    let mut groups = Vec::new();
+    for _ in 0..views.len() {
+        let any_left = is_left_out.contains(&true);
+        if groups.len() >= num_groups && !(all && any_left) {
+            break;
+        }
+        // The first of equally far views.
+        let candidates = (0..views.len()).rev().filter(|&view| is_left_out[view] || !any_left);
+        let Some(seed) = candidates.max_by(|&a, &b| to_seeds[a].total_cmp(&to_seeds[b])) else { break };
+        let group = distance.nearest(views, seed, num_views);
+        for &view in &group {
+            is_left_out[view] = false;
+        }
+        for (view, least) in to_seeds.iter_mut().enumerate() {
+            *least = least.min(distance.between(&views[view], &views[seed]));
+        }
+        groups.push(group);
+    }
+    groups.sort();
+    groups.dedup();
+    groups
+}
+
 #[cfg(test)]
 mod tests {
+    use clift_core::DVec3;
+
     use super::*;
 
-    #[test]
-    fn groups_with_a_shared_frame_have_the_median_scale() {
-        let frame = |scale: f64| PoseNormalization { mean_c2w: Pose::IDENTITY, scale };
-        let group = |scale: f64| ContextGroup { views: vec![0, 1], frame: frame(scale) };
-        let groups = vec![group(4.0), group(3.0), group(9.0)];
-        let contexts = Contexts { frames: vec![0, 1], groups, normalization: frame(0.5) }.with_shared_frame();
-        assert_eq!(contexts.normalization, frame(2.0));
-        assert!(contexts.groups.iter().all(|group| group.frame == frame(1.0)));
+    fn on_a_line(places: &[f64]) -> Vec<Pose> {
+        places.iter().map(|&x| Pose { translation: x * DVec3::X, ..Pose::IDENTITY }).collect()
     }
 
     #[test]
-    fn few_tokens_have_few_groups() {
-        let most = |stored, num_frames| most_groups(stored, num_frames);
-        assert_eq!(most(Some(TokenCount::Count(20)), 40), Some(1));
-        assert_eq!(most(Some(TokenCount::Count(100)), 40), Some(3));
-        assert_eq!(most(Some(TokenCount::Count(960)), 40), None, "32 for each of 30 groups");
-        assert_eq!([most(Some(TokenCount::Share(0.001)), 40), most(None, 40)], [None; 2]);
+    fn groups_are_neighbours_and_contain_every_view() {
+        let steady: Vec<f64> = (0..10).map(f64::from).collect();
+        let groups = |places: &[f64], count| neighbour_groups(&on_a_line(places), 4, count, true);
+        assert_eq!(groups(&steady, 1), [vec![0, 1, 2, 3], vec![2, 3, 4, 5], vec![6, 7, 8, 9]], "as few as needed");
+        let more = groups(&steady, 6);
+        assert!(more.iter().all(|group| group.len() == 4 && group[3] - group[0] <= 4), "{more:?}");
+        assert_eq!(groups(&steady[..3], 5), [vec![0, 1, 2]], "equal groups count once");
+        assert_eq!(neighbour_groups(&on_a_line(&steady), 4, 1, false), [[0, 1, 2, 3]], "others are left out");
+        // Two clusters far apart are not mixed.
+        let apart = groups(&[0.0, 0.1, 0.2, 0.3, 9.0, 9.1, 9.2, 9.3], 2);
+        assert_eq!(apart, [vec![0, 1, 2, 3], vec![4, 5, 6, 7]]);
+        // Few tokens have few groups: 32 for each of 30.
+        let most = |count| most_groups(Some(TokenCount::Count(count)), 40);
+        assert_eq!([20, 100, 960].map(most), [Some(1), Some(3), None]);
     }
 
     #[test]
     fn context_frames_are_checked_spread_or_neighbours() {
-        let at = |x: f64| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY };
-        let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
+        let poses = on_a_line(&[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
         let frames = |choice: ContextChoice| choose_frames(&poses, &choice, &[]).map_err(|error| error.to_string());
         assert_eq!(frames(ContextChoice::Spread(4)).unwrap(), [0, 3, 6, 9]);
         assert_eq!(choose_frames(&poses[..3], &ContextChoice::Spread(4), &[]).unwrap(), [0, 1, 2]);
         assert_eq!(frames(ContextChoice::Frames(vec![7, 2])).unwrap(), [7, 2]);
         assert_eq!(frames(ContextChoice::Near { frame: 8, num_views: 3 }).unwrap(), [7, 8, 9]);
-        let all = ContextChoice::Neighbours { num_views: 4, num_groups: None, joined: false };
-        assert_eq!(frames(all).unwrap(), (0..10).collect::<Vec<_>>());
         assert_eq!(choose_frames(&poses, &ContextChoice::Spread(9), &[0, 4, 8]).unwrap(), [1, 2, 3, 5, 6, 7, 9]);
         let near = frames(ContextChoice::Near { frame: 12, num_views: 3 }).unwrap_err();
         assert_eq!(near, "`--near` = 12: there is no frame 12; the scene has frames 0 to 9");
-        let message = |list: &[usize]| frames(ContextChoice::Frames(list.to_vec())).unwrap_err();
-        assert_eq!(message(&[0, 10]), "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9");
-        assert_eq!(message(&[3, 3]), "`--context` = 3,3: write at least two frames, each once");
-        assert_eq!(message(&[3]), "`--context` = 3: write at least two frames, each once");
+        for (list, expected) in [
+            (vec![0, 10], "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9"),
+            (vec![3, 3], "`--context` = 3,3: write at least two frames, each once"),
+            (vec![3], "`--context` = 3: write at least two frames, each once"),
+        ] {
+            assert_eq!(frames(ContextChoice::Frames(list)).unwrap_err(), expected);
+        }
     }
 }

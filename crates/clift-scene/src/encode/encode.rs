@@ -5,10 +5,9 @@ use clift_core::{ClipViews, derive_seed};
 use clift_data::ClipReader;
 use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
 
-use crate::encode::contexts::Contexts;
-use crate::encode::options::EncodeOptions;
+use crate::encode::contexts::{Contexts, EncodeOptions};
 use crate::error::SceneError;
-use crate::scene::scene::{ContextGroup, Scene};
+use crate::scene::scene::Scene;
 
 /// An encoded scene.
 #[derive(Clone, Debug)]
@@ -19,38 +18,11 @@ pub struct EncodedScene {
     pub context: ClipViews,
     /// Number of tokens before clustering.
     pub num_lift_tokens: usize,
-    /// Variance within clusters as a share of the total variance of the tokens; the mean of the groups.
-    pub cluster_error: f64,
     /// Clusters of the tokens.
     pub clusters: SceneClusters,
 }
 
-impl EncodedScene {
-    /// Orders the tokens by their patches, as files with coded tokens do.
-    ///
-    /// # Errors
-    /// The errors of the clusters, which stay valid.
-    pub fn sort_tokens(&mut self) -> Result<(), SceneError> {
-        let (ids, dim) = (&self.scene.token_ids, self.scene.model.dim);
-        let mut order: Vec<usize> = (0..ids.len()).collect();
-        order.sort_by_key(|&token| ids[token]);
-        let mut place = vec![0; ids.len()];
-        order.iter().enumerate().for_each(|(new, &old)| place[old] = new as u32);
-        let assignment = self.clusters.assignment().iter().map(|&cluster| place[cluster as usize]).collect();
-        let tokens = order.iter().flat_map(|&old| &self.scene.tokens[old * dim..(old + 1) * dim]).copied().collect();
-        self.scene.token_ids = order.iter().map(|&old| ids[old]).collect();
-        self.scene.tokens = tokens;
-        self.clusters = SceneClusters::new(assignment, self.scene.token_ids.clone())?;
-        Ok(())
-    }
-}
-
 /// Encodes a scene of `reader`. The clusters of a single group equal those of `clift eval` for the same contexts and count.
-///
-/// # Errors
-/// [`ModelError::BadConfig`] for frames that the scene does not have, [`ModelError::BadTokenCount`] for a count above the
-/// number of tokens or below the number of groups, [`ModelError::BadConfig`] for fewer tokens than all of a network without
-/// clusters, and the errors of reading the images.
 pub fn encode(
     model: &TrainedModel,
     reader: &ClipReader,
@@ -71,15 +43,13 @@ pub fn encode(
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
 
     let (mut tokens, mut assignment, mut token_ids) = (Vec::new(), Vec::new(), Vec::new());
-    let mut cluster_error = 0.0;
     for (group, count) in groups.iter().zip(counts) {
-        let encoded = encode_group(model, &members(&context, group), count, options, seed)?;
+        let (values, clusters) = encode_group(model, &group.members(&context), count, options, seed)?;
         // Tokens and patches are counted over all groups.
         let (first_cluster, first_patch) = (token_ids.len() as u32, assignment.len() as u32);
-        assignment.extend(encoded.clusters.assignment().iter().map(|&cluster| first_cluster + cluster));
-        token_ids.extend(encoded.clusters.centroid_index().iter().map(|&patch| first_patch + patch));
-        tokens.extend(encoded.tokens);
-        cluster_error += encoded.cluster_error / groups.len() as f64;
+        assignment.extend(clusters.assignment().iter().map(|&cluster| first_cluster + cluster));
+        token_ids.extend(clusters.centroid_index().iter().map(|&patch| first_patch + patch));
+        tokens.extend(values);
     }
     let clusters = SceneClusters::new(assignment, token_ids.clone())?;
     debug_assert_eq!(tokens.len(), token_ids.len() * model.config.dim, "a row per centroid");
@@ -103,7 +73,7 @@ pub fn encode(
         token_ids,
         tokens,
     };
-    Ok(EncodedScene { scene, context, num_lift_tokens: clusters.assignment().len(), cluster_error, clusters })
+    Ok(EncodedScene { scene, context, num_lift_tokens: clusters.assignment().len(), clusters })
 }
 
 /// Returns the share of all tokens that is stored by default: a quarter, but of many groups an eighth at least and `MOST` tokens
@@ -138,12 +108,8 @@ fn token_counts(
         count @ TokenCount::Count(_) => {
             let (count, groups) = (count.of(sum)?, sizes.len());
             if count < groups {
-                return Err(ModelError::BadTokenCount {
-                    text: count.to_string(),
-                    reason: format!(
-                        "the scene has {groups} groups of views; write at least as many, or fewer --groups"
-                    ),
-                });
+                let reason = format!("the scene has {groups} groups of views; write at least as many");
+                return Err(ModelError::BadTokenCount { text: count.to_string(), reason });
             }
             let parts = (0..groups).map(|group| (count + group) / groups);
             Ok(parts.zip(all).map(|(part, all)| part.min(all)).collect())
@@ -151,22 +117,14 @@ fn token_counts(
     }
 }
 
-/// Tokens and clusters of views that were encoded together.
-struct EncodedGroup {
-    /// Stored tokens, `[S, D]`.
-    tokens: Vec<f32>,
-    clusters: SceneClusters,
-    /// As [`EncodedScene::cluster_error`].
-    cluster_error: f64,
-}
-
+/// Encodes the views of a group; returns the stored tokens `[S, D]` and the clusters.
 fn encode_group(
     model: &TrainedModel,
     views: &ClipViews,
     count: usize,
     options: &EncodeOptions,
     seed: u64,
-) -> Result<EncodedGroup, SceneError> {
+) -> Result<(Vec<f32>, SceneClusters), SceneError> {
     let lift = model.network.encode(&Views::upload(&[views], &model.device)?); // [1, N, D]
     let supports_clusters = model.config.architecture.supports_clusters();
     let clusters = if supports_clusters {
@@ -176,26 +134,13 @@ fn encode_group(
     } else {
         SceneClusters::identity(count)
     };
-    let cluster_error = clusters.variance_within(&lift.to_host()?);
     let index = Clusters::new(vec![clusters.clone()])?.upload(&model.device);
     let tokens = match (supports_clusters, model.has_condenser) {
         (false, _) => lift,
         (true, true) => model.network.compress(lift, &index),
         (true, false) => lift.centroids(&index),
     };
-    Ok(EncodedGroup { tokens: tokens.to_host()?, clusters, cluster_error })
-}
-
-/// Returns the views of a group, with cameras in its frame.
-fn members(views: &ClipViews, group: &ContextGroup) -> ClipViews {
-    let len = views.height * views.width * 3;
-    let members = || group.views.iter().map(|&view| view as usize);
-    ClipViews {
-        images: members().flat_map(|view| &views.images[view * len..][..len]).copied().collect(),
-        cameras: group.cameras(members().map(|view| views.cameras[view])),
-        frame_index: members().map(|view| views.frame_index[view]).collect(),
-        ..*views
-    }
+    Ok((tokens.to_host()?, clusters))
 }
 
 #[cfg(test)]

@@ -1,25 +1,29 @@
 //! A scene file from captured images, with a report.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clift_data::ClipReader;
-use clift_model::TrainedModel;
+use clift_model::{ModelError, SelectionPreset, TrainedModel};
 
-use crate::check::view_check::{CheckedView, read_others, scene_renderer};
-use crate::encode::coding::{Coder, Coding, count_for_bytes};
-use crate::encode::contexts::Contexts;
+use crate::check::{CheckedView, nearest_image, read_other};
+use crate::codec::token_codec::TokenCodec;
+use crate::encode::contexts::EncodeOptions;
 use crate::encode::encode::{EncodedScene, encode};
-use crate::encode::options::EncodeOptions;
+use crate::encode::refine::refine;
 use crate::error::SceneError;
-use crate::fit::step_choice::{expected_step, step_for_bytes, step_for_loss};
+use crate::scene::scene::Scene;
+use crate::scene::scene_renderer::SceneRenderer;
+use crate::scene::token_coding::{CodedLoss, TokenCoding, TokenFormat};
 
 /// Settings of [`encode_scene`].
 #[derive(Clone, Debug, Default)]
 pub struct SceneOptions {
-    /// Contexts and tokens. With [`Coding::Bytes`], the default number of stored tokens is the one of the best expected PSNR.
+    /// Contexts and tokens.
     pub encode: EncodeOptions,
+    /// Steps that fit the tokens of each group to the photos, for a scene of several groups; 0 for none.
+    pub refine_steps: usize,
     /// How tokens are stored; by default coded with a loss of 0.02 dB if the model has a codec, else in f16.
-    pub coding: Option<Coding>,
+    pub coding: Option<TokenCoding>,
     /// The weight file, whose folder has the codec.
     pub weights: PathBuf,
     /// The scene file to write.
@@ -39,11 +43,7 @@ pub struct WrittenScene {
     pub frame_names: Vec<String>,
     /// Number of frames of the scene.
     pub num_frames: usize,
-    /// Width and height of the images in pixels.
-    pub image_size: [usize; 2],
-    /// Width and height of the central part of the images that is used; `None` if that is nearly all.
-    pub cropped: Option<[usize; 2]>,
-    /// The context views, rendered.
+    /// Context views, rendered: at most 16, spread over all.
     pub contexts: Vec<CheckedView>,
     /// Frames that are not context views, rendered: those held out, or one; none if no other frame can be read.
     pub others: Vec<CheckedView>,
@@ -56,30 +56,23 @@ impl WrittenScene {
     }
 }
 
-/// Encodes scene `index` of `reader`, writes its file, and compares renderings of it with the photos.
-///
-/// # Errors
-/// As [`encode`], [`ModelError::NoCodec`](clift_model::ModelError::NoCodec) without a codec that the coding needs,
-/// [`ModelError::SceneFile`](clift_model::ModelError::SceneFile) for a file that cannot be written.
+/// Encodes scene `index` of `reader`, fits its tokens if that is chosen, writes its file, and compares renderings of it with the
+/// photos. `progress` gets the numbers of fitted and of all groups.
 pub fn encode_scene(
     model: &TrainedModel,
     reader: &ClipReader,
     index: usize,
     options: &SceneOptions,
+    progress: &mut dyn FnMut(usize, usize),
 ) -> Result<WrittenScene, SceneError> {
-    let frame_names = reader.source.frame_names(index)?;
-    let coder = Coder::new(options.coding, &options.weights, model)?;
-    let stored_tokens = match (options.encode.stored_tokens, &coder) {
-        (None, Coder::Bytes(codec, bytes)) => {
-            let contexts = Contexts::choose(reader, index, &options.encode)?;
-            let size = [reader.options.height, reader.options.width];
-            Some(count_for_bytes((codec, *bytes), &contexts, size, &options.encode.model_path))
-        }
-        (stored_tokens, _) => stored_tokens,
-    };
-    let encode_options = EncodeOptions { stored_tokens, ..options.encode.clone() };
-    let mut encoded = encode(model, reader, index, &encode_options)?;
-    let stored = write(&coder, &mut encoded, options, (model, reader, index))?;
+    let (frame_names, num_frames) = (reader.source.frame_names(index)?, reader.source.num_frames(index)?);
+    let codec = codec_for(options.coding, &options.weights, model)?;
+    let mut encoded = encode(model, reader, index, &options.encode)?;
+    if options.refine_steps > 0 && encoded.scene.groups.len() > 1 {
+        let EncodedScene { scene, context, .. } = &mut encoded;
+        refine(model, context, scene, (options.refine_steps, options.encode.seed), progress)?;
+    }
+    let stored = write(&mut encoded.scene, codec, options)?;
     let EncodedScene { scene, context, .. } = &encoded;
     let is_context = |frame: &usize| context.frame_index.contains(frame);
     let held_out: Vec<usize> = match options.encode.hold_out {
@@ -87,72 +80,57 @@ pub fn encode_scene(
         every => reader.source.held_out(index, every)?.into_iter().filter(|frame| !is_context(frame)).collect(),
     };
     let others = match held_out[..] {
-        [] => read_others(reader, index, scene, 1)?,
+        [] => read_other(reader, index, scene)?,
         _ => Some(reader.read_views(index, &held_out, &scene.world)?),
     };
-    let mut renderer = scene_renderer(model, scene)?;
+    let (renderer, rules) = (model.network.renderer.clone(), SelectionPreset::Paper.rules());
+    let mut renderer = SceneRenderer::new(scene, renderer, rules, &model.device)?;
     let contexts = CheckedView::contexts(&mut renderer, context)?;
-    let others = others.map_or(Ok(Vec::new()), |others| CheckedView::others(&mut renderer, &others, context))?;
-    let image_size = reader.source.image_size(index, scene.context_frames[0] as usize)?;
-    Ok(WrittenScene {
-        stored,
-        file_bytes: std::fs::metadata(&options.out).map_or(0, |file| file.len()),
-        frame_names,
-        num_frames: reader.source.num_frames(index)?,
-        image_size,
-        cropped: cropped(image_size, [scene.width, scene.height]),
-        contexts,
-        others,
-        encoded,
-    })
+    let nearest = |c2w| nearest_image(context, c2w);
+    let others = others.map_or(Ok(Vec::new()), |others| CheckedView::compare(&mut renderer, &others, nearest))?;
+    let file_bytes = std::fs::metadata(&options.out).map_or(0, |file| file.len());
+    Ok(WrittenScene { encoded, stored, file_bytes, frame_names, num_frames, contexts, others })
 }
 
-/// Writes the scene, whose tokens become those of a coded file, and returns how they are stored.
-fn write(
-    coder: &Coder,
-    encoded: &mut EncodedScene,
-    options: &SceneOptions,
-    (model, reader, index): (&TrainedModel, &ClipReader, usize),
-) -> Result<String, SceneError> {
-    let scene = &encoded.scene;
-    let (codec, step, note) = match coder {
-        Coder::Plain(format) => {
-            scene.write(&options.out, *format)?;
-            return Ok(format.to_string());
-        }
-        Coder::Expected(codec, loss) => {
-            (codec, expected_step(scene, codec, *loss)?, format!("expected loss {loss} dB"))
-        }
-        Coder::Measured(codec, loss) => {
-            let (step, loss) = step_for_loss(model, reader, index, (scene, &encoded.context), codec, *loss)?;
-            (codec, step, format!("measured loss {loss:.3} dB"))
-        }
-        Coder::Bytes(codec, bytes) => {
-            let step = step_for_bytes(scene, codec, *bytes)?.0;
-            (codec, step, format!("at most {:.3} kB", *bytes as f64 / 1e3))
-        }
-    };
-    encoded.sort_tokens()?;
-    encoded.scene.write_coded(&options.out, codec, step)?;
-    encoded.scene.tokens = encoded.scene.rounded_tokens(codec, step)?;
-    Ok(format!("coded, {note}"))
-}
-
-/// Returns the size of the central part of an image that has the proportions of the network's; `None` if little is lost.
-fn cropped(image: [usize; 2], network: [usize; 2]) -> Option<[usize; 2]> {
-    let of_other = |side: usize| image[1 - side] * network[side] / network[1 - side];
-    let kept = [0, 1].map(|side| image[side].min(of_other(side)));
-    (0..2).any(|side| kept[side] * 10 < image[side] * 9).then_some(kept)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn much_cropping_is_told() {
-        assert_eq!(cropped([1080, 1920], [64, 64]), Some([1080, 1080]));
-        assert_eq!(cropped([4000, 1000], [128, 64]), Some([2000, 1000]));
-        assert_eq!([cropped([64, 64], [64, 64]), cropped([105, 100], [64, 64])], [None, None]);
+/// Reads the codec beside the weights that a coding needs, with the loss: by default the default loss if there is a codec.
+/// `None` for tokens as plain numbers.
+fn codec_for(
+    coding: Option<TokenCoding>,
+    weights: &Path,
+    model: &TrainedModel,
+) -> Result<Option<(TokenCodec, CodedLoss)>, SceneError> {
+    let architecture = model.config.architecture;
+    match coding {
+        Some(TokenCoding::Plain(_)) => Ok(None),
+        Some(TokenCoding::Coded(_)) if !architecture.supports_clusters() => Err(SceneError::request(format!(
+            "the tokens of {architecture} have no codec; store them with --format f32, f16 or int8"
+        ))),
+        Some(TokenCoding::Coded(loss)) => match TokenCodec::beside(weights, model)? {
+            Some(codec) => Ok(Some((codec, loss))),
+            None => Err(ModelError::NoCodec { path: TokenCodec::path_of(weights) }.into()),
+        },
+        None => Ok(TokenCodec::beside(weights, model)?.map(|codec| (codec, CodedLoss::default()))),
     }
+}
+
+/// Writes a scene, whose tokens become those of a coded file, and returns how they are stored.
+fn write(
+    scene: &mut Scene,
+    codec: Option<(TokenCodec, CodedLoss)>,
+    options: &SceneOptions,
+) -> Result<String, SceneError> {
+    let Some((codec, loss)) = codec else {
+        let format = match options.coding {
+            Some(TokenCoding::Plain(format)) => format,
+            _ => TokenFormat::F16,
+        };
+        scene.write(&options.out, format)?;
+        return Ok(format.to_string());
+    };
+    let num_tokens = scene.model.num_tokens(scene.num_members(), scene.height, scene.width)?;
+    let share = scene.num_tokens() as f64 / num_tokens as f64;
+    let step = codec.rates.step_for_loss(share, loss.db()) as f32;
+    scene.write_coded(&options.out, &codec, step)?;
+    scene.tokens = scene.rounded_tokens(&codec, step)?;
+    Ok(format!("coded, expected loss {} dB", loss.db()))
 }

@@ -31,8 +31,7 @@ mod tests {
         let size = |photo| photo_size([128, 128], 8, photo);
         assert_eq!(size([500, 500]), [128, 128]);
         assert_eq!([size([640, 480]), size([480, 640])], [[144, 112], [112, 144]]);
-        assert_eq!(size([3000, 2000]), [152, 104]);
-        assert_eq!([size([1920, 1080]), size([1080, 1920])], [[168, 96], [96, 168]]);
+        assert_eq!(size([1920, 1080]), [168, 96]);
         assert_eq!(size([8000, 1000]), [176, 88], "a panorama is cropped");
         for (width, height) in (1..40).flat_map(|width| (1..40).map(move |height| (width * 31, height * 17))) {
             let [w, h] = size([width, height]);

@@ -1,9 +1,9 @@
 //! Rules of a valid scene, checked before a scene is written and after it is read, because files may be hostile.
 
-use clift_core::{Camera, CameraError, check_near};
+use clift_core::check_near;
 use clift_model::TokenKind;
 
-use crate::scene::scene::{HEADER_BYTES, Scene};
+use crate::scene::scene::Scene;
 
 const MAX_VIEWS: usize = 1024;
 /// Longest side of a context view or a rendered image in pixels.
@@ -17,7 +17,9 @@ impl Scene {
         let num_patches = self.check_views()?;
         self.check_tokens(num_patches)?;
         for (view, camera) in self.context.iter().enumerate() {
-            check_camera(camera).map_err(|error| format!("context camera {view}: {error}"))?;
+            let checked = camera.intrinsics.validate().and_then(|()| camera.c2w.validate());
+            let checked = checked.and_then(|()| check_near(&camera.c2w));
+            checked.map_err(|error| format!("context camera {view}: {error}"))?;
         }
         for frame in std::iter::once(&self.world).chain(self.groups.iter().map(|group| &group.frame)) {
             frame.mean_c2w.validate().map_err(|error| format!("mean pose: {error}"))?;
@@ -25,15 +27,8 @@ impl Scene {
                 return Err(format!("pose scale {}, expected a positive number", frame.scale));
             }
         }
-        let is_hash = self.renderer_hash.len() == 64 && self.renderer_hash.bytes().all(|c| c.is_ascii_hexdigit());
-        if !is_hash {
+        if self.renderer_hash.len() != 64 || !self.renderer_hash.bytes().all(|c| c.is_ascii_hexdigit()) {
             return Err(format!("renderer hash {:?}, expected 64 hexadecimal digits", self.renderer_hash));
-        }
-        if self.key.len() + self.model_path.len() > HEADER_BYTES {
-            return Err(format!(
-                "key and model path of {} bytes, longer than a header of {HEADER_BYTES} bytes",
-                self.key.len() + self.model_path.len()
-            ));
         }
         Ok(())
     }
@@ -43,10 +38,7 @@ impl Scene {
         self.model.validate().map_err(|error| error.to_string())?;
         let views = self.context.len();
         if !(1..=MAX_VIEWS).contains(&views) || self.context_frames.len() != views {
-            let frames = self.context_frames.len();
-            return Err(format!(
-                "{views} context cameras and {frames} frame numbers, expected equal numbers from 1 to {MAX_VIEWS}"
-            ));
+            return Err(format!("{views} context cameras, expected 1 to {MAX_VIEWS}, and as many frame numbers"));
         }
         self.check_groups()?;
         if self.height.max(self.width) > MAX_SIDE_PX {
@@ -110,10 +102,4 @@ impl Scene {
         }
         Ok(())
     }
-}
-
-fn check_camera(camera: &Camera) -> Result<(), CameraError> {
-    camera.intrinsics.validate()?;
-    camera.c2w.validate()?;
-    check_near(&camera.c2w)
 }

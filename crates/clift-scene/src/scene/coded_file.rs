@@ -1,29 +1,12 @@
-//! The scene file with coded tokens.
+//! The scene file with coded tokens: a safetensors file with one tensor, `scene`, of all bytes after the header.
 //!
-//! | part | type |
-//! |---|---|
-//! | length of the header, little-endian | u64 |
-//! | header: JSON of safetensors with one tensor, `scene`, which is the rest of the file | |
-//! | step of the coefficients | f32 |
-//! | `world_mean_c2w` and `world_scale`, the normalization of poses: quaternion `x, y, z, w`, center, scale | 4 x f32, 4 x f64 |
-//! | number of intrinsics: 1 if the views have the same, else that of the views | u32 |
-//! | for each of them: `fx, fy, cx, cy` in pixels | 4 x f32 |
-//! | for each context view: quaternion `x, y, z, w` and center of the pose, frame number | 7 x f32, u32 |
-//! | number of groups, their sizes, and the context views of the groups, one group after the other | u16 |
-//! | zero or two bytes 0, up to a multiple of four bytes | |
-//! | of several groups: the frame of each, as the normalization above | 4 x f32, 4 x f64 |
-//! | words of the entropy coder: token ids, then levels by direction | u32 |
-//! | CRC-32 of everything before | u32 |
-//!
-//! `__metadata__` holds strings: `format` = `clift-scene`, `version` = `7`, `key`, `codec` (hash of the model's codec),
-//! `model_path`, `views` (number, height and width, as `4x64x64`) and `tokens` (their number). Everything else is in the
-//! codec, see [`TokenCodec`]. `docs/reference/files.md` describes how tokens are decoded.
+//! `docs/reference/files.md` lists its parts, and describes how tokens are decoded. What does not differ between the scenes of a
+//! model is in the codec, see [`TokenCodec`].
 // N patches of the context views, S tokens, V context views
 
 use std::fmt::Write as _;
 use std::path::Path;
 
-use clift_core::replace_file;
 use clift_model::{ModelConfig, ModelError};
 
 use crate::codec::prediction::Places;
@@ -32,13 +15,11 @@ use crate::scene::coded_views::{read_groups, read_views, read_world, write_group
 use crate::scene::header::{COPY_AGAIN, Fields, GIVE_MODEL, Refusal, refusal, write_fields};
 use crate::scene::scene::{CODED_VERSION, FORMAT, Scene};
 use crate::scene::token_coding::{CodedLoss, TokenCoding};
-use crate::scene::write::{WRITABLE_FOLDER, check_output_path};
+use crate::scene::write::{FEWER, refusal_to_write, write_file};
+use crate::tensors::{numbers, u32_bytes};
 
 impl Scene {
     /// Returns the bytes of the scene's coded file. Tokens are stored in the order of their ids.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for a codec of another model, or a step that is not positive or too small.
     pub fn coded_bytes(&self, codec: &TokenCodec, step: f32) -> Result<Vec<u8>, ModelError> {
         let is_same_model = codec.model == ModelConfig { patch_grids: codec.model.patch_grids, ..self.model.clone() };
         if codec.renderer_hash != self.renderer_hash || codec.kind != self.kind || !is_same_model {
@@ -51,7 +32,7 @@ impl Scene {
         write_world(&self.world, &mut body);
         write_views(&self.context, &self.context_frames, &mut body);
         write_groups(&self.groups, &mut body);
-        body.extend(words.iter().flat_map(|word| word.to_le_bytes()));
+        body.extend(u32_bytes(words));
         let length = body.len() + 4;
 
         let views = format!("{}x{}x{}", self.context.len(), self.height, self.width);
@@ -74,9 +55,6 @@ impl Scene {
     }
 
     /// Returns the tokens as they come back from a coded file.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for a step that is not positive, or too small for the tokens.
     pub fn rounded_tokens(&self, codec: &TokenCodec, step: f32) -> Result<Vec<f32>, ModelError> {
         codec.round(&self.tokens, self.places(), step)
     }
@@ -89,11 +67,8 @@ impl Scene {
 
     /// Writes the scene with coded tokens, as [`write`](Self::write) writes plain ones.
     pub fn write_coded(&self, path: &Path, codec: &TokenCodec, step: f32) -> Result<(), ModelError> {
-        let refuse = |reason, fix| ModelError::SceneFile { action: "write", reason, fix, path: path.into() };
-        self.check().map_err(|reason| refuse(reason, "encode other views or fewer tokens"))?;
-        let bytes = self.coded_bytes(codec, step)?;
-        check_output_path(path)?;
-        replace_file(path, &bytes).map_err(|error| refuse(error.to_string(), WRITABLE_FOLDER))
+        self.check().map_err(|reason| refusal_to_write(path, reason, FEWER))?;
+        write_file(path, &self.coded_bytes(codec, step)?)
     }
 }
 
@@ -126,7 +101,7 @@ pub(crate) fn from_coded_bytes(
     let Some((step, world, (context, context_frames), groups, words)) = split() else {
         return Err(format!("{} bytes of {views} views and coded tokens", body.len()).into());
     };
-    let words = words.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect();
+    let words = numbers(words, u32::from_le_bytes);
     let mut scene = Scene {
         key: fields.get("key")?.into(),
         kind: codec.kind,

@@ -5,6 +5,7 @@ use clift_core::{Camera, DMat3, Pose, PoseNormalization};
 use glam::DQuat;
 
 use crate::scene::scene::{ContextGroup, split_groups};
+use crate::tensors::{f32_bytes, f64_bytes, numbers};
 
 /// Bytes of the normalization: rotation; center and scale in f64, for worlds of any size.
 const WORLD_BYTES: usize = 4 * 4 + 4 * 8;
@@ -15,32 +16,32 @@ const INTRINSICS_BYTES: usize = 4 * 4;
 /// Adds the normalization. As in the views, a rotation is stored as a unit quaternion: what is not orthonormal in its matrix,
 /// up to the tolerance of the check, is lost.
 pub(crate) fn write_world(world: &PoseNormalization, body: &mut Vec<u8>) {
-    body.extend(f32_bytes(&quaternion(world.mean_c2w)));
+    body.extend(narrow(&quaternion(world.mean_c2w)));
     let [x, y, z] = world.mean_c2w.translation.to_array();
-    body.extend([x, y, z, world.scale].into_iter().flat_map(f64::to_le_bytes));
+    body.extend(f64_bytes([x, y, z, world.scale]));
 }
 
 /// Reads the normalization; returns it and the rest of the bytes. `None` if there are too few bytes.
 pub(crate) fn read_world(bytes: &[u8]) -> Option<(PoseNormalization, &[u8])> {
     let (bytes, rest) = bytes.split_at_checked(WORLD_BYTES)?;
-    let [x, y, z, scale] = doubles(&bytes[16..]);
+    let values = numbers(&bytes[16..], f64::from_le_bytes);
+    let [x, y, z, scale] = std::array::from_fn(|i| values[i]);
     Some((PoseNormalization { mean_c2w: pose(floats(bytes), [x, y, z]), scale }, rest))
 }
 
 /// Adds the number of intrinsics, which is 1 if those of all views are equal, the intrinsics, and the views.
 pub(crate) fn write_views(context: &[Camera], frames: &[u32], body: &mut Vec<u8>) {
-    let intrinsics: Vec<Vec<u8>> = context.iter().map(|camera| f32_bytes(&camera.intrinsics.to_array())).collect();
+    let intrinsics: Vec<Vec<u8>> = context.iter().map(|camera| narrow(&camera.intrinsics.to_array())).collect();
     let count = if intrinsics.windows(2).all(|pair| pair[0] == pair[1]) { 1 } else { intrinsics.len() };
     body.extend((count as u32).to_le_bytes());
     body.extend(intrinsics[..count].concat());
     for (camera, frame) in context.iter().zip(frames) {
-        body.extend(f32_bytes(&quaternion(camera.c2w)));
-        body.extend(f32_bytes(&camera.c2w.translation.to_array()));
+        body.extend(narrow(&quaternion(camera.c2w)));
+        body.extend(narrow(&camera.c2w.translation.to_array()));
         body.extend(frame.to_le_bytes());
     }
 }
 
-/// Cameras and frame numbers.
 type Views = (Vec<Camera>, Vec<u32>);
 
 /// Reads `views` views; returns cameras, frame numbers and the rest of the bytes. `None` if there are too few bytes.
@@ -79,9 +80,7 @@ pub(crate) fn write_groups(groups: &[ContextGroup], body: &mut Vec<u8>) {
 
 /// Reads groups; returns them and the rest of the bytes. `None` if there are too few bytes.
 pub(crate) fn read_groups(bytes: &[u8]) -> Option<(Vec<ContextGroup>, &[u8])> {
-    let numbers = |bytes: &[u8]| -> Vec<u32> {
-        bytes.as_chunks().0.iter().map(|number| u32::from(u16::from_le_bytes(*number))).collect()
-    };
+    let numbers = |bytes: &[u8]| numbers(bytes, |number| u32::from(u16::from_le_bytes(number)));
     let (count, rest) = bytes.split_first_chunk::<2>()?;
     let (sizes, rest) = rest.split_at_checked(2 * usize::from(u16::from_le_bytes(*count)))?;
     let sizes = numbers(sizes);
@@ -107,22 +106,14 @@ fn pose(quaternion: [f64; 4], center: [f64; 3]) -> Pose {
     Pose { rotation: DMat3::from_quat(DQuat::from_array(quaternion).normalize()), translation: center.into() }
 }
 
-/// Returns the rotation of a pose, `x, y, z, w`.
 fn quaternion(c2w: Pose) -> [f64; 4] {
     DQuat::from_mat3(&c2w.rotation).to_array()
 }
 
-fn f32_bytes(values: &[f64]) -> Vec<u8> {
-    values.iter().flat_map(|value| (*value as f32).to_le_bytes()).collect()
+fn narrow(values: &[f64]) -> Vec<u8> {
+    f32_bytes(values.iter().map(|value| *value as f32))
 }
 
-/// Returns the first numbers of bytes.
-fn doubles<const N: usize>(bytes: &[u8]) -> [f64; N] {
-    let values = bytes.as_chunks::<8>().0;
-    std::array::from_fn(|i| f64::from_le_bytes(values[i]))
-}
-
-/// Returns the first numbers of bytes.
 fn floats<const N: usize>(bytes: &[u8]) -> [f64; N] {
     let values = bytes.as_chunks::<4>().0;
     std::array::from_fn(|i| f64::from(f32::from_le_bytes(values[i])))

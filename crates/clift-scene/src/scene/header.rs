@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 use std::fmt::Write as _;
 
-/// The cause and the remedy.
 pub(crate) struct Refusal {
     pub reason: String,
     pub fix: &'static str,
@@ -22,7 +21,6 @@ pub(crate) fn refusal(reason: impl Into<String>, fix: &'static str) -> Refusal {
 pub(crate) const COPY_AGAIN: &str = "copy it again, or encode the scene again";
 pub(crate) const GIVE_MODEL: &str = "give the run it was encoded with (--model RUN)";
 
-/// Metadata of a header that was read.
 pub(crate) struct Fields(pub HashMap<String, String>);
 
 impl Fields {

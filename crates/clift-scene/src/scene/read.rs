@@ -9,10 +9,8 @@ use safetensors::{SafeTensorError, SafeTensors};
 use crate::codec::token_codec::TokenCodec;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{COPY_AGAIN, Fields, Refusal, refusal};
-use crate::scene::model_place::find_model;
-use crate::scene::scene::{CODED_VERSION, ContextGroup, FORMAT, Scene, VERSION, dtype_name, split_groups};
-use crate::scene::token_coding::TokenCoding;
-use crate::scene::token_format::TokenFormat;
+use crate::scene::scene::{CODED_VERSION, ContextGroup, FORMAT, Scene, VERSION, dtype_name, find_model, split_groups};
+use crate::scene::token_coding::{TokenCoding, TokenFormat};
 use crate::tensors::Tensors;
 
 /// Longest accepted header; those of `HEADER_BYTES` are written.
@@ -28,10 +26,6 @@ const OTHER_VERSION: &str = "encode the scene again, or render it with the clift
 
 impl Scene {
     /// Reads and checks a scene file. Coded tokens need the codec of the scene's model, see [`find_model`](Self::find_model).
-    ///
-    /// # Errors
-    /// [`ModelError::SceneFile`] for a file that is not a scene, has another version, is truncated or inconsistent, and for
-    /// coded tokens without their codec.
     pub fn read(path: &Path) -> Result<(Self, TokenCoding), ModelError> {
         Self::read_for(path, None)
     }

@@ -1,39 +1,19 @@
 //! A compressed scene: its tokens, and the cameras and sizes that rendering needs besides the weights.
 //!
-//! A `.clift` file with plain tokens is safetensors with a header of fixed length, so that its size is known in advance
-//! ([`scene_file_bytes`]); `coded_file` has the layout of a file with coded tokens:
-//!
-//! | part | type | shape |
-//! |---|---|---|
-//! | length of the header, little-endian | u64 | |
-//! | header: JSON with spaces up to [`HEADER_BYTES`] | | |
-//! | `context_c2w`: normalized poses, camera to world | F64 | `[views, 4, 4]` |
-//! | `context_intrinsics`: `fx, fy, cx, cy` in pixels | F64 | `[views, 4]` |
-//! | `group_sizes`: number of context views of each group that was encoded together | U32 | `[groups]` |
-//! | `group_views`: context views of the groups, one group after the other | U32 | `[members]` |
-//! | `group_mean_c2w`, `group_scale`: the frame of each group, as `world_mean_c2w` of normalized poses | F64 | `[groups, 4, 4]`, `[groups]` |
-//! | `world_mean_c2w`, `world_scale`: the normalization of poses | F64 | `[4, 4]`, `[1]` |
-//! | `token_rays`: `[moment, direction]` through the center of a token's patch in the frame of its group, not of learned tokens | F32 | `[tokens, 6]` |
-//! | `token_scales`, with `int8` tokens only | F32 | `[tokens]` |
-//! | `context_frames`: frame number of each view in the capture | U32 | `[views]` |
-//! | `token_ids`: patch of the members of all groups of each token, not of learned tokens | U32 | `[tokens]` |
-//! | `tokens` | F32, F16 or I8 | `[tokens, dim]` |
-//!
-//! `__metadata__` holds strings: `format` = `clift-scene`, `version`, `key` of the scene, `kind` of its tokens, `model`
-//! (sizes and variant of the network as JSON), `renderer` (hash of the renderer's weights), `model_path` (path of the model,
-//! relative to the folder of the file or absolute), `height` and `width` of the context views.
+//! A `.clift` file with plain tokens is safetensors with a header of fixed length ([`HEADER_BYTES`], filled with spaces), so that
+//! its size is known in advance ([`scene_file_bytes`]); `coded_file` has the other layout. `docs/reference/files.md` describes
+//! the tensors, whose types and shapes [`Scene::write`] lists.
 // S storage tokens, V context views, G groups, M members of all groups, D width
 
-use clift_core::{Camera, Pose, PoseNormalization};
-use clift_model::{ModelConfig, TokenKind, TokenRay};
+use std::path::{Component, Path, PathBuf};
 
-use crate::scene::token_format::TokenFormat;
+use clift_core::{Camera, ClipViews, Pose, PoseNormalization, folder_of};
+use clift_model::{ModelConfig, SHIPPED_MODEL, TokenKind, TokenRay};
+
+use crate::scene::token_coding::TokenFormat;
 
 /// Length of the header of a scene file in bytes.
 pub const HEADER_BYTES: usize = 2048;
-
-/// Most context views whose tokens a view is rendered from, where groups are joined: as many as in training.
-pub(crate) const MAX_JOINED_VIEWS: usize = 8;
 
 pub(crate) const FORMAT: &str = "clift-scene";
 /// The version of files with plain tokens.
@@ -97,6 +77,18 @@ impl ContextGroup {
         let map = |camera: Camera| Camera { c2w: self.frame.normalize(camera.c2w), ..camera };
         cameras.into_iter().map(map).collect()
     }
+
+    /// Returns the views of the group, with cameras in its frame, of all context views.
+    pub(crate) fn members(&self, context: &ClipViews) -> ClipViews {
+        let len = context.height * context.width * 3;
+        let views = || self.views.iter().map(|&view| view as usize);
+        ClipViews {
+            images: views().flat_map(|view| &context.images[view * len..][..len]).copied().collect(),
+            cameras: self.cameras(views().map(|view| context.cameras[view])),
+            frame_index: views().map(|view| context.frame_index[view]).collect(),
+            ..*context
+        }
+    }
 }
 
 impl Scene {
@@ -128,35 +120,9 @@ impl Scene {
         tokens
     }
 
-    /// Returns the largest number of tokens that one view is rendered from: the tokens of the largest group. A network that joins
-    /// groups renders from eight views: their tokens, for the eight views with the most.
+    /// Returns the largest number of tokens that one view is rendered from: the tokens of the largest group.
     pub fn max_render_tokens(&self) -> usize {
-        if !self.model.joins_groups() {
-            return self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default();
-        }
-        let mut counts: Vec<usize> = self.tokens_of_members().iter().map(Vec::len).collect();
-        counts.sort_unstable_by(|a, b| b.cmp(a));
-        counts.iter().take(MAX_JOINED_VIEWS).sum()
-    }
-
-    /// Returns the positions of the tokens of every member of all groups, ascending.
-    pub(crate) fn tokens_of_members(&self) -> Vec<Vec<u32>> {
-        let patches = self.height / self.model.patch_size * (self.width / self.model.patch_size);
-        let mut tokens = vec![Vec::new(); self.num_members()];
-        for (token, &id) in self.token_ids.iter().enumerate() {
-            tokens[id as usize / patches].push(token as u32);
-        }
-        tokens
-    }
-
-    /// Returns the groups whose tokens views are rendered from, with the positions of their tokens: one of all context views
-    /// for a network that joins groups.
-    pub(crate) fn render_groups(&self) -> Vec<(ContextGroup, Vec<u32>)> {
-        if !self.model.joins_groups() {
-            return self.groups.iter().cloned().zip(self.tokens_of_groups()).collect();
-        }
-        let views = self.groups.iter().flat_map(|group| group.views.clone()).collect();
-        vec![(ContextGroup { views, ..ContextGroup::of_all(0) }, (0..self.num_tokens() as u32).collect())]
+        self.tokens_of_groups().iter().map(Vec::len).max().unwrap_or_default()
     }
 
     /// Returns the ray of every token in the frame of its group, through the center of its patch; none of learned tokens.
@@ -169,7 +135,6 @@ impl Scene {
         TokenRay::of_patches(ids, &members, self.height, self.width, self.model.patch_size)
     }
 
-    /// Returns `[moment, direction]` of every token's ray.
     pub(crate) fn plucker_rays(&self) -> Vec<[f64; 6]> {
         self.token_rays().iter().map(TokenRay::plucker).collect()
     }
@@ -183,6 +148,33 @@ impl Scene {
             format,
         )
     }
+
+    /// Returns the `model_path` of a scene file at `file`: relative to the folder of the file for a relative `model`, so that
+    /// both can be moved together and read from any folder; an absolute `model` as it is.
+    pub fn model_path_for(model: &Path, file: &Path) -> String {
+        let relative = || {
+            let from = folder_of(file).canonicalize().ok()?;
+            let to = model.canonicalize().ok()?;
+            let shared = from.components().zip(to.components()).take_while(|(a, b)| a == b).count();
+            let up = from.components().skip(shared).map(|_| Component::ParentDir);
+            let path: PathBuf = up.chain(to.components().skip(shared)).collect();
+            Some(path)
+        };
+        let path = if model.is_absolute() { None } else { relative() };
+        path.unwrap_or_else(|| model.into()).to_string_lossy().into_owned()
+    }
+
+    /// Returns the path of the model of the scene that was read from `file`. A relative model path starts at the folder of
+    /// the file. The path need not exist. A missing `models/rooms` is the [shipped model](clift_model::find_shipped).
+    pub fn find_model(&self, file: &Path) -> PathBuf {
+        find_model(&self.model_path, file)
+    }
+}
+
+pub(crate) fn find_model(model_path: &str, file: &Path) -> PathBuf {
+    let path = folder_of(file).join(model_path);
+    // The scene may come from a machine that has the repository.
+    if path.ends_with(SHIPPED_MODEL) && !path.exists() { SHIPPED_MODEL.into() } else { path }
 }
 
 /// Splits the members of all groups by the sizes of the groups.
@@ -221,7 +213,6 @@ pub fn scene_file_bytes(
     (8 + HEADER_BYTES + frame + num_views * view + groups + num_tokens * token) as u64
 }
 
-/// Returns the safetensors type of tokens.
 pub(crate) const fn dtype_name(format: TokenFormat) -> &'static str {
     match format {
         TokenFormat::F32 => "F32",

@@ -12,8 +12,7 @@ use clift_model::{
 };
 
 use crate::scene::frame_size::{FramePlan, TrainedImage};
-use crate::scene::group_shares::group_shares;
-use crate::scene::scene::{ContextGroup, MAX_JOINED_VIEWS, Scene};
+use crate::scene::scene::{ContextGroup, Scene};
 
 /// Most images of one call, which share keys and values, and most frames that are rendered together.
 const IMAGES_PER_CALL: usize = 8;
@@ -21,9 +20,12 @@ const IMAGES_PER_CALL: usize = 8;
 const PATCHES_PER_CALL: usize = 1 << 15;
 /// Most pixels of several frames that are rendered together.
 const PIXELS_PER_CALL: usize = 1 << 21;
+/// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
+const BLEND: f64 = 0.15;
+const MAX_BLENDED: usize = 3;
 
-/// Returns the number of frames of `height` by `width` pixels that are rendered together.
-fn frames_per_call(height: usize, width: usize) -> usize {
+/// Returns the number of frames of `height` by `width` pixels that [`SceneRenderer::render`] renders together.
+pub fn frames_per_call(height: usize, width: usize) -> usize {
     (PIXELS_PER_CALL / (height * width).max(1)).clamp(1, IMAGES_PER_CALL)
 }
 
@@ -45,10 +47,6 @@ pub fn frame_bytes(scene: &Scene, model: &ModelConfig, [height, width]: [usize; 
 }
 
 /// Reads the renderer of a scene from a weight file.
-///
-/// # Errors
-/// [`ModelError::Weights`] for a file that cannot be read or lacks parameters of the renderer,
-/// [`ModelError::OtherRenderer`] for other weights than those of the scene.
 pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let renderer = open_renderer(&scene.model, weights, device)?;
     let got = renderer_hash(&renderer, &scene.model);
@@ -89,32 +87,23 @@ pub struct SceneRenderer {
 struct TokenGroup {
     context: ContextGroup,
     trained: TrainedImage,
-    /// Poses of the context views in the scene.
     views: Vec<Pose>,
-    /// Positions of the tokens in the scene.
     tokens: Vec<u32>,
-    /// Tokens of every view, where a view is rendered from those of the nearest few; empty otherwise.
-    of_views: Vec<Vec<u32>>,
-    /// Keys and values of the tokens.
     cache: KeyValueCache,
     selector: Selector,
 }
 
 impl SceneRenderer {
     /// Copies a scene's tokens to a device. `renderer` comes from [`load_renderer`], on the same device.
-    ///
-    /// # Errors
-    /// [`ModelError::BadRay`] for a scene with rays that are not finite; [`Scene::read`] returns no such scene.
     pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
         let (rays, dim) = (scene.token_rays(), scene.model.dim);
         let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
-        let is_joined = scene.model.joins_groups() && scene.num_members() > MAX_JOINED_VIEWS;
         let mut groups = Vec::with_capacity(scene.groups.len());
         let mut first_patch = 0;
-        for (group, tokens) in scene.render_groups() {
+        for (group, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
             let rows = tokens.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
             let values = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, tokens.len(), dim]);
-            let context = scene.group_cameras(&group);
+            let context = scene.group_cameras(group);
             let cameras = Cameras::of_views(&context, scene.height, scene.width, device)?;
             let patches: Vec<u32> = tokens.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
             let values = Tensor::from_data(values, device);
@@ -122,11 +111,10 @@ impl SceneRenderer {
             first_patch += (group.views.len() * patches_per_view) as u32;
             groups.push(TokenGroup {
                 views: group.views.iter().map(|&view| scene.context[view as usize].c2w).collect(),
-                context: group,
+                context: group.clone(),
                 trained: TrainedImage::new(scene, &context),
                 cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
                 selector: Selector::new(rules, &rays)?,
-                of_views: if is_joined { scene.tokens_of_members() } else { Vec::new() },
                 tokens,
             });
         }
@@ -144,11 +132,6 @@ impl SceneRenderer {
     /// Returns the most tokens that a frame is rendered from at once ([`Scene::max_render_tokens`]).
     pub fn max_render_tokens(&self) -> usize {
         self.max_render_tokens
-    }
-
-    /// Returns the number of frames of `width` by `height` pixels that are rendered together.
-    pub fn frames_per_call(&self, height: usize, width: usize) -> usize {
-        frames_per_call(height, width)
     }
 
     /// Resets token selection: the next frame does not depend on earlier frames.
@@ -169,16 +152,9 @@ impl SceneRenderer {
     /// Renders the next frames of a path from the groups of tokens nearest to each: of every group from the
     /// `num_render_tokens` tokens nearest to the view, or all its tokens if it has no more. A frame between groups is a mean
     /// of their images with weights that change continuously along a path; of `num_render_tokens`, each group has its share.
-    /// A network that [joins groups](ModelConfig::joins_groups) has one group of all tokens; a frame is rendered from those of
-    /// the eight context views nearest to it.
-    /// Frames of all tokens are rendered [`Self::frames_per_call`] at a time. A frame of another size or field of view than
+    /// Frames of all tokens are rendered [`frames_per_call`] at a time. A frame of another size or field of view than
     /// the context views is resampled from images like theirs: it keeps the field of view of its camera, and a larger one has
     /// no more detail.
-    ///
-    /// # Errors
-    /// [`ModelError::NotFinite`] for a camera or an image that is not finite, [`ModelError::BadConfig`] for no tokens, for
-    /// fewer learned tokens than all, and for a field of view of more than 64 context views,
-    /// [`ModelError::Device`] if an image cannot be read from the device.
     pub fn render(
         &mut self,
         views: &[Camera],
@@ -194,13 +170,14 @@ impl SceneRenderer {
             );
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: num_render_tokens.to_string(), fix });
         }
-        let shares: Vec<Vec<(usize, f64)>> = views.iter().map(|view| self.shares(&view.c2w)).collect();
+        let to_group = |view: &Camera, group: &TokenGroup| self.distance.to_group(&view.c2w, &group.views);
+        let to_groups = |view: &Camera| self.groups.iter().map(|group| to_group(view, group)).collect::<Vec<_>>();
+        let shares: Vec<_> = views.iter().map(|view| group_shares(&to_groups(view))).collect();
         let mut rendered: Vec<Option<RenderedView>> = vec![None; views.len()];
         for group in 0..self.groups.len() {
             let share = |frame: usize| shares[frame].iter().find(|(other, _)| *other == group).map(|(_, share)| *share);
             let frames: Vec<(usize, f64)> = (0..views.len()).filter_map(|frame| Some((frame, share(frame)?))).collect();
-            let is_alone = selects || !self.groups[group].of_views.is_empty();
-            let per_call = if is_alone { 1 } else { frames_per_call(height, width) };
+            let per_call = if selects { 1 } else { frames_per_call(height, width) };
             for frames in frames.chunks(per_call) {
                 let cameras: Vec<Camera> = frames.iter().map(|&(frame, _)| views[frame]).collect();
                 let count = (num_render_tokens as f64 * frames[0].1).ceil() as usize;
@@ -232,14 +209,12 @@ impl SceneRenderer {
         let plan = |view: &Camera| FramePlan::new(trained, view, size);
         let plans: Vec<FramePlan> =
             tokens.context.cameras(views.iter().copied()).iter().map(plan).collect::<Result<_, _>>()?;
-        let near = tokens.near(self.distance, &views[0].c2w);
-        let selected = match (num_render_tokens, near) {
-            (Some(count), near) if near.as_ref().is_none_or(|near| count < near.len()) => {
-                let (view, size) = plans[0].whole();
-                let is_near = near.map(|near| mask(&near, tokens.tokens.len())).unwrap_or_default();
-                Some(tokens.selector.select_among(&is_near, &view, size, count)?)
+        let selected = match num_render_tokens.filter(|count| *count < tokens.tokens.len()) {
+            Some(count) => {
+                let (view, [height, width]) = plans[0].whole();
+                Some(tokens.selector.select(&view, height, width, count)?)
             }
-            (_, near) => near,
+            None => None,
         };
         let select_s = if selected.is_some() { started.elapsed().as_secs_f64() } else { 0.0 };
         let started = Instant::now();
@@ -282,37 +257,27 @@ impl SceneRenderer {
         };
         Ok(plans.iter().map(frame).collect())
     }
-
-    /// Returns the groups that a view is rendered from, with their shares, which add up to 1.
-    fn shares(&self, view: &Pose) -> Vec<(usize, f64)> {
-        let distances: Vec<f64> = self.groups.iter().map(|group| self.distance.to_group(view, &group.views)).collect();
-        group_shares(&distances)
-    }
 }
 
-impl TokenGroup {
-    /// Returns the tokens of the context views nearest to a view, ascending; `None` for all tokens.
-    fn near(&self, distance: ViewDistance, view: &Pose) -> Option<Vec<u32>> {
-        if self.of_views.is_empty() {
-            return None;
-        }
-        let to_view = |member: &usize| distance.between(&self.views[*member], view);
-        let mut members: Vec<usize> = (0..self.views.len()).collect();
-        members.sort_by(|a, b| to_view(a).total_cmp(&to_view(b)));
-        let mut near: Vec<u32> =
-            members[..MAX_JOINED_VIEWS].iter().flat_map(|&member| &self.of_views[member]).copied().collect();
-        near.sort_unstable();
-        Some(near)
+/// Returns the nearest groups and their shares of a frame, which add up to 1 and change continuously with the distances: a
+/// share falls linearly to 0 where a group is [`BLEND`] farther than the nearest, or as far as the next after
+/// [`MAX_BLENDED`].
+pub(crate) fn group_shares(distances: &[f64]) -> Vec<(usize, f64)> {
+    let mut order: Vec<usize> = (0..distances.len()).collect();
+    order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]));
+    let Some(&nearest) = order.first() else { return Vec::new() };
+    let limit = distances[nearest] + BLEND;
+    let limit = order.get(MAX_BLENDED).map_or(limit, |&next| limit.min(distances[next]));
+    let rooms = order.into_iter().take(MAX_BLENDED).map(|group| (group, limit - distances[group]));
+    let mut near: Vec<(usize, f64)> = rooms.filter(|(_, room)| *room > 0.0).collect();
+    if near.is_empty() {
+        return vec![(nearest, 1.0)];
     }
-}
-
-/// Returns whether each of `count` tokens is among `tokens`.
-fn mask(tokens: &[u32], count: usize) -> Vec<bool> {
-    let mut mask = vec![false; count];
-    for &token in tokens {
-        mask[token as usize] = true;
+    let sum: f64 = near.iter().map(|(_, room)| room).sum();
+    for (_, room) in &mut near {
+        *room /= sum;
     }
-    mask
+    near
 }
 
 impl RenderedView {

@@ -2,7 +2,7 @@
 //!
 //! - `progress`: state.json of a checkpoint
 //! - `checkpoints`: save, resume, keep the best
-//! - `newest`: the model of a run in training
+//! - `newest`: the model of a run that is still training
 
 pub(crate) mod checkpoints;
 pub(crate) mod newest;

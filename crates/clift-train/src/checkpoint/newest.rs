@@ -43,12 +43,13 @@ impl NewestCheckpoint {
     /// Reads the model, with a trained condenser in stage 2.
     pub fn open(&self, config: &Config, run: &Path, device: &Device) -> Result<TrainedModel, TrainError> {
         let initial = Network::new(&config.model, config.seed, device);
-        let checkpoints = checkpoints(run, self.stage).with_model(config.model.clone());
+        let checkpoints = Checkpoints { model: Some(config.model.clone()), ..checkpoints(run, self.stage) };
         let network = checkpoints.load_model(self.step, initial)?;
         Ok(TrainedModel::snapshot(&network, &config.model, self.stage == Stage::Stage2))
     }
 }
 
 fn checkpoints(run: &Path, stage: Stage) -> Checkpoints {
-    Checkpoints::new(run.join(stage.name()).join("checkpoints"), CheckpointConfig::default())
+    let folder = run.join(stage.name()).join("checkpoints");
+    Checkpoints { folder, retention: CheckpointConfig::default(), model: None }
 }

@@ -11,34 +11,28 @@ use clift_core::{derive_seed, item_rng, uniform_below};
 use clift_data::{ClipReader, DataError, ViewIndices};
 use clift_model::{Encoder, SceneClusters, Views};
 
-use crate::cluster_cache::cache::{CacheSettings, ClusterCache, VERSION};
-use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
+use crate::cluster_cache::cache::{CacheSettings, VERSION};
+use crate::cluster_cache::resume_log::{CacheKey, Outcome, ResumeLog};
 use crate::config::config::{ClustersConfig, Config};
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{Event, RunStep, Sink};
 
-/// Inputs of the cluster cache of a run.
 pub struct ClusterBuilder<'a> {
     pub config: &'a Config,
-    /// Training scenes.
     pub reader: &'a ClipReader,
     /// The trained encoder, without autodiff.
     pub encoder: &'a Encoder,
     pub encoder_hash: &'a str,
     pub device: &'a Device,
-    /// Ranks that share the scenes.
     pub ranks: &'a Ranks,
 }
 
-/// The outcome of a context set: its frames and clusters, or why the scene was skipped.
-type Clustered = Result<(Vec<usize>, Vec<u32>, Vec<u32>), String>;
-
 impl ClusterBuilder<'_> {
-    /// Clusters every training scene `num_passes` times, each time with one context set and one count of the grid, and opens
-    /// the cache. Resumes an interrupted build with the same encoder and settings; the bytes do not depend on interruptions.
+    /// Clusters every training scene `num_passes` times, each time with one context set and one count of the grid.
+    /// Resumes an interrupted build with the same encoder and settings; the bytes do not depend on interruptions.
     /// The cache is written to a temporary folder, which is then renamed. Scenes that cannot be used are skipped.
-    pub fn build(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
+    pub fn build(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<(), TrainError> {
         let Self { config, reader, encoder_hash, ranks, .. } = *self;
         // Rank 0 alone writes.
         let mut log = None;
@@ -54,25 +48,18 @@ impl ClusterBuilder<'_> {
         let total_sets = (config.clusters.num_passes * num_scenes) as u64;
         let started = std::time::Instant::now();
         sink.event(&Event::StepStarted { run_step: RunStep::Clusters, done, num_steps: total_sets });
-        let of_set = |set: u64| (set / num_scenes as u64, set as usize % num_scenes);
         for first in (done..total_sets).step_by(ranks.num_ranks()) {
             let set = first + ranks.rank() as u64;
-            let own = (set < total_sets).then(|| self.cluster_or_skip(of_set(set))).transpose()?;
+            let cluster = || self.cluster_or_skip(set / num_scenes as u64, set as usize % num_scenes);
+            let own = (set < total_sets).then(cluster).transpose()?;
             let all = ranks.gather((own, stop.load(Ordering::Relaxed)))?;
             let is_stopped = all.iter().any(|(_, is_stopped)| *is_stopped);
-            let sets = all.into_iter().filter_map(|(set, _)| set);
-            for (set, outcome) in (first..).zip(sets) {
+            for (set, outcome) in (first..).zip(all.into_iter().filter_map(|(outcome, _)| outcome)) {
                 if let Some(log) = &mut log {
-                    let key = reader.source.key(of_set(set).1);
-                    match outcome {
-                        Ok((context, tokens, centroids)) => {
-                            log.add(key, context, &SceneClusters::new(tokens, centroids)?)?;
-                        }
-                        Err(reason) => {
-                            sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
-                            log.skip(key, &reason)?;
-                        }
+                    if let Outcome::Skipped { key, reason } = &outcome {
+                        sink.event(&Event::Skipped { key: key.clone(), reason: reason.clone() });
                     }
+                    log.add(&outcome)?;
                 }
                 sink.event(&Event::Progress { run_step: RunStep::Clusters, done: set + 1, total: total_sets });
             }
@@ -81,16 +68,23 @@ impl ClusterBuilder<'_> {
             }
         }
         sink.event(&Event::StepFinished { run_step: RunStep::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
-        ranks.from_root(|| log.take().map_or(Ok(()), |log| log.publish(folder, num_scenes)))?;
-        ClusterCache::open(folder, config, encoder_hash)
+        ranks.from_root(|| log.take().map_or(Ok(()), |log| log.publish(folder, num_scenes)))
     }
 
-    fn cluster_or_skip(&self, (pass, scene): (u64, usize)) -> Result<Clustered, TrainError> {
+    fn cluster_or_skip(&self, pass: u64, scene: usize) -> Result<Outcome, TrainError> {
+        let key = self.reader.source.key(scene).to_owned();
         match self.cluster_scene(pass, scene) {
             Ok((context, clusters)) => {
-                Ok(Ok((context, clusters.assignment().to_vec(), clusters.centroid_index().to_vec())))
+                let short = |ids: &[u32]| {
+                    let short = |&id| u16::try_from(id).expect("a config allows at most MAX_TOKENS tokens");
+                    ids.iter().map(short).collect()
+                };
+                let (tokens, centroids) = (short(clusters.assignment()), short(clusters.centroid_index()));
+                Ok(Outcome::Clustered { key, context, tokens, centroids })
             }
-            Err(TrainError::Data(error)) if is_of_scene(&error) => Ok(Err(error.to_string())),
+            Err(TrainError::Data(error)) if is_of_scene(&error) => {
+                Ok(Outcome::Skipped { key, reason: error.to_string() })
+            }
             Err(other) => Err(other),
         }
     }

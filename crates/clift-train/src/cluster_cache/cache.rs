@@ -8,7 +8,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use clift_core::{PoseRotation, PoseScale};
-use clift_data::{Crop, FileOptions, SceneFilters, SkipReport, SourceKind, SyntheticConfig, ViewSampler};
+use clift_data::{FileOptions, SceneFilters, SkipReport, SourceKind, SyntheticConfig, ViewSampler};
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -27,13 +27,10 @@ pub struct CacheEntry {
     /// Frames of the contexts.
     pub context: Vec<usize>,
     pub num_tokens: usize,
-    /// Number of clusters.
     pub num_storage_tokens: usize,
-    /// Offset of the entry in `clusters.bin`.
     pub offset_bytes: u64,
 }
 
-/// Content of `index.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CacheIndex {
@@ -58,14 +55,12 @@ pub(crate) struct CacheSettings {
     height: usize,
     pose_rotation: PoseRotation,
     pose_scale: PoseScale,
-    crop: Crop,
     filters: SceneFilters,
     views: ViewSampler,
     clusters: ClustersConfig,
 }
 
 impl CacheSettings {
-    /// Returns the settings of a config.
     pub fn new(config: &Config) -> Self {
         let data = config.data.clone();
         Self {
@@ -78,7 +73,6 @@ impl CacheSettings {
             height: data.height,
             pose_rotation: data.pose_rotation,
             pose_scale: data.pose_scale,
-            crop: data.crop,
             filters: data.filters,
             views: data.views,
             clusters: config.clusters.clone(),
@@ -124,10 +118,8 @@ impl ClusterCache {
                 format!("its tokens are of encoder {}, the run's is {}", short(&index.encoder), short(encoder));
             return Err(stale(reason));
         }
-        let wanted = CacheSettings::new(config);
-        if index.settings != wanted {
-            let key = first_difference(&[&index.settings, &wanted].map(|settings| serde_json::json!(settings)));
-            return Err(stale(format!("{} differs from that of this run", key.unwrap_or_default())));
+        if index.settings != CacheSettings::new(config) {
+            return Err(stale("it was built with other settings than those of this run".into()));
         }
         if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
             let CacheEntry { key, num_tokens, num_storage_tokens, .. } = entry;
@@ -149,15 +141,7 @@ impl ClusterCache {
         &self.index.entries
     }
 
-    /// Returns the scenes that could not be clustered.
-    pub fn skipped(&self) -> &SkipReport {
-        &self.index.skipped
-    }
-
     /// Reads the clusters of one entry.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`], and [`clift_model::ModelError::BadClusters`] for inconsistent indices.
     pub fn read(&self, entry: &CacheEntry) -> Result<SceneClusters, TrainError> {
         let path = self.folder.join("clusters.bin");
         let mut bytes = vec![0; entry.num_bytes() as usize];
@@ -171,55 +155,5 @@ impl ClusterCache {
             bytes.as_chunks::<2>().0.iter().map(|bytes| u32::from(u16::from_le_bytes(*bytes))).collect();
         let centroids = values.split_off(entry.num_tokens);
         Ok(SceneClusters::new(values, centroids)?)
-    }
-}
-
-/// Returns the first key, by path, with two values.
-fn first_difference(values: &[Value; 2]) -> Option<String> {
-    let [Some(one), Some(other)] = values.each_ref().map(Value::as_object) else { return None };
-    let key = one.keys().chain(other.keys()).find(|key| one.get(*key) != other.get(*key))?;
-    let below = [one, other].map(|object| object.get(key).cloned().unwrap_or_default());
-    Some(first_difference(&below).map_or_else(|| key.clone(), |path| format!("{key}.{path}")))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Opens a cache whose only entry has these counts, and returns the error message or "opened".
-    fn opened(num_tokens: usize, num_storage_tokens: usize) -> String {
-        let config = Config::default();
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let entry = CacheEntry { key: "a".into(), context: vec![0], num_tokens, num_storage_tokens, offset_bytes: 0 };
-        let index = CacheIndex {
-            version: VERSION,
-            encoder: "e".into(),
-            settings: CacheSettings::new(&config),
-            skipped: SkipReport::new(1),
-            entries: vec![entry],
-        };
-        std::fs::write(folder.path().join("index.json"), serde_json::to_vec(&index).expect("JSON")).expect("writable");
-        std::fs::write(folder.path().join("clusters.bin"), [0, 0, 0, 0]).expect("writable");
-        ClusterCache::open(folder.path(), &config, "e").map_or_else(|error| error.to_string(), |_| "opened".into())
-    }
-
-    #[test]
-    fn impossible_counts_are_refused_before_allocation() {
-        assert_eq!(opened(1, 1), "opened");
-        for (num_tokens, num_storage_tokens) in [(usize::MAX, 3), (1 << 62, 1 << 62), (0, 0), (1, 2), (2, 0)] {
-            let message = opened(num_tokens, num_storage_tokens);
-            let expected = format!("scene a has {num_storage_tokens} clusters of {num_tokens} tokens");
-            assert!(message.contains(&expected), "{message}");
-        }
-    }
-
-    #[test]
-    fn the_first_other_setting_is_named() {
-        let mut config = Config::default();
-        let before = CacheSettings::new(&config);
-        config.clusters.kmeans.max_iterations += 1;
-        let values = [before, CacheSettings::new(&config)].map(|settings| serde_json::json!(settings));
-        assert_eq!(first_difference(&values).as_deref(), Some("clusters.kmeans.max_iterations"));
-        assert_eq!(first_difference(&[values[0].clone(), values[0].clone()]), None);
     }
 }

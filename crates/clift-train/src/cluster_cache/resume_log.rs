@@ -9,11 +9,9 @@ use std::path::{Path, PathBuf};
 
 use clift_core::{make_folder, publish_folder, replace_file};
 use clift_data::SkipReport;
-use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
 use crate::cluster_cache::cache::{CacheEntry, CacheIndex, CacheSettings};
-use crate::config::config::MAX_TOKENS;
 use crate::error::TrainError;
 
 const WRITING: &str = "writing the cluster cache";
@@ -25,20 +23,17 @@ const JOURNAL: &str = "journal.jsonl";
 #[serde(deny_unknown_fields)]
 pub(crate) struct CacheKey {
     pub version: u32,
-    /// Hash of the encoder's weights.
     pub encoder: String,
     pub settings: CacheSettings,
 }
 
-/// A further line: the outcome of a context set.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-enum Outcome {
+pub(crate) enum Outcome {
     Clustered { key: String, context: Vec<usize>, tokens: Vec<u16>, centroids: Vec<u16> },
     Skipped { key: String, reason: String },
 }
 
-/// A cluster cache during its build.
 #[derive(Debug)]
 pub(crate) struct ResumeLog {
     folder: PathBuf,
@@ -69,20 +64,7 @@ impl ResumeLog {
         self.num_sets
     }
 
-    pub fn add(&mut self, key: &str, context: Vec<usize>, clusters: &SceneClusters) -> Result<(), TrainError> {
-        let short = |ids: &[u32]| ids.iter().map(|&id| u16::try_from(id)).collect::<Result<Vec<u16>, _>>();
-        let (Ok(tokens), Ok(centroids)) = (short(clusters.assignment()), short(clusters.centroid_index())) else {
-            return Err(TrainError::NoScenes { reason: format!("a scene has more than {MAX_TOKENS} tokens") });
-        };
-        self.write_outcome(&Outcome::Clustered { key: key.into(), context, tokens, centroids })
-    }
-
-    /// Logs that the next set could not be clustered.
-    pub fn skip(&mut self, key: &str, reason: &str) -> Result<(), TrainError> {
-        self.write_outcome(&Outcome::Skipped { key: key.into(), reason: reason.into() })
-    }
-
-    fn write_outcome(&mut self, outcome: &Outcome) -> Result<(), TrainError> {
+    pub fn add(&mut self, outcome: &Outcome) -> Result<(), TrainError> {
         self.write_line(outcome)?;
         self.num_sets += 1;
         Ok(())
@@ -197,19 +179,16 @@ mod tests {
         (place, folder)
     }
 
-    fn clusters(num_tokens: usize) -> SceneClusters {
-        SceneClusters::new(vec![0; num_tokens], vec![0]).unwrap()
-    }
-
     /// Adds sets up to `until`: the third cannot be clustered, the others grow.
     fn add_sets(log: &mut ResumeLog, until: u64) {
         for set in log.num_sets()..until {
             let key = format!("scene {}", set % 4);
-            if set == 2 {
-                log.skip(&key, "too short").unwrap();
-            } else {
-                log.add(&key, vec![0, set as usize], &clusters(2 + set as usize)).unwrap();
-            }
+            let (context, tokens, centroids) = (vec![0, set as usize], vec![0; 2 + set as usize], vec![0]);
+            log.add(&match set {
+                2 => Outcome::Skipped { key, reason: "too short".into() },
+                _ => Outcome::Clustered { key, context, tokens, centroids },
+            })
+            .unwrap();
         }
     }
 
@@ -258,7 +237,7 @@ mod tests {
     fn empty_cache_is_refused_with_the_first_reason() {
         let place = tempfile::tempdir().unwrap();
         let mut log = ResumeLog::open(&place.path().join("clusters.tmp"), cache_key()).unwrap();
-        log.skip("a", "too short").unwrap();
+        log.add(&Outcome::Skipped { key: "a".into(), reason: "too short".into() }).unwrap();
         let message = log.publish(&place.path().join("clusters"), 1).unwrap_err().to_string();
         assert!(message.contains("too short"), "{message}");
         assert_eq!(std::fs::read_dir(place.path()).unwrap().count(), 0);

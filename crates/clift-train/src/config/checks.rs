@@ -4,7 +4,7 @@ use clift_core::{BadConfig, check_config};
 use clift_data::{DataConfig, SourceKind, Split};
 use clift_model::{Grouping, PERCEPTUAL_MIN_SIZE_PX};
 
-use crate::config::config::{CheckpointConfig, Config, MAX_TOKENS, OptimizerConfig};
+use crate::config::config::{Config, MAX_TOKENS, OptimizerConfig};
 use crate::error::{TrainError, bad};
 use crate::events::Stage;
 
@@ -40,11 +40,6 @@ impl Config {
         ] {
             in_range(key, value, least, most)?;
         }
-        let CheckpointConfig { every, keep_every, .. } = *checkpoint;
-        let is_saved = keep_every == 0 || (every > 0 && keep_every.is_multiple_of(every));
-        check_config(is_saved, "checkpoint.keep_every", keep_every, || {
-            format!("write 0 or a multiple of checkpoint.every, which is {every}")
-        })?;
         for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.stored_tokens", &eval.stored_tokens)] {
             check_config(!counts.is_empty(), key, "[]", || "write at least one count".into())?;
         }
@@ -73,23 +68,17 @@ impl Config {
     fn validate_further_sizes(&self) -> Result<(), BadConfig> {
         let (patch_size, most) = (self.model.patch_size, self.data.width.saturating_mul(self.data.height));
         for size in &self.stage1.further_sizes {
-            let [is_small, has_patches] = [
-                size[0].saturating_mul(size[1]) <= most,
-                size.iter().all(|&side| side > 0 && side.is_multiple_of(patch_size)),
-            ];
-            check_config(has_patches, "stage1.further_sizes", format!("{size:?}"), || {
-                format!("write multiples of model.patch_size = {patch_size}")
-            })?;
-            check_config(is_small, "stage1.further_sizes", format!("{size:?}"), || {
-                format!("write a size of at most {most} pixels, as data.width x data.height")
-            })?;
-            let is_large = size.iter().all(|&side| side >= PERCEPTUAL_MIN_SIZE_PX);
-            let has_enough = is_large || self.loss.perceptual_weight == 0.0;
-            check_config(has_enough, "stage1.further_sizes", format!("{size:?}"), || {
-                format!(
-                    "VGG-19 needs {PERCEPTUAL_MIN_SIZE_PX} pixels: write longer sides, or loss.perceptual_weight = 0"
-                )
-            })?;
+            let check = |is_valid: bool, fix: String| {
+                check_config(is_valid, "stage1.further_sizes", format!("{size:?}"), || fix)
+            };
+            let has_patches = size.iter().all(|&side| side > 0 && side.is_multiple_of(patch_size));
+            check(has_patches, format!("write multiples of model.patch_size = {patch_size}"))?;
+            let fix = format!("write a size of at most {most} pixels, as data.width x data.height");
+            check(size[0].saturating_mul(size[1]) <= most, fix)?;
+            let has_enough =
+                self.loss.perceptual_weight == 0.0 || size.iter().all(|&side| side >= PERCEPTUAL_MIN_SIZE_PX);
+            let fix = "write longer sides, or loss.perceptual_weight = 0";
+            check(has_enough, format!("VGG-19 needs {PERCEPTUAL_MIN_SIZE_PX} pixels: {fix}"))?;
         }
         Ok(())
     }
@@ -109,19 +98,12 @@ impl Config {
 
     /// Checks that images of half the width and height have a size that stage 1 can train on, if `stage1.half_resolution` is
     /// above 0. [`Self::validate`] does not: a trained model is used without such images.
-    ///
-    /// # Errors
-    /// [`TrainError::BadConfig`] if half of a side has no whole number of patches or is too short for the perceptual loss.
     pub fn validate_half_resolution(&self) -> Result<(), TrainError> {
         let half = self.stage1.half_resolution;
-        if half == 0.0 {
-            return Ok(());
-        }
         let (multiple, least) = (2 * self.model.patch_size, 2 * PERCEPTUAL_MIN_SIZE_PX);
         let further = self.stage1.further_sizes.iter().flatten().map(|&side| ("stage1.further_sizes", side));
-        for (key, value) in
-            [("data.width", self.data.width), ("data.height", self.data.height)].into_iter().chain(further)
-        {
+        let sides = [("data.width", self.data.width), ("data.height", self.data.height)].into_iter().chain(further);
+        for (key, value) in sides.filter(|_| half > 0.0) {
             if !value.is_multiple_of(multiple) {
                 let fix = format!("write 0, or a multiple of 2 x model.patch_size = {multiple} as {key}, not {value}");
                 return Err(bad("stage1.half_resolution", half, &fix));
@@ -137,8 +119,9 @@ impl Config {
 
     /// Checks weights and sizes of the loss. The VGG weights are checked when training starts.
     fn validate_loss(&self) -> Result<(), BadConfig> {
-        self.loss.validate()?;
         let weight = self.loss.perceptual_weight;
+        let is_weight = weight >= 0.0 && weight.is_finite();
+        check_config(is_weight, "loss.perceptual_weight", weight, || "write 0 or a positive number".into())?;
         let (width, height) = (self.data.width, self.data.height);
         let (is_large, least) = (width.min(height) >= PERCEPTUAL_MIN_SIZE_PX, PERCEPTUAL_MIN_SIZE_PX);
         check_config(weight == 0.0 || is_large, "loss.perceptual_weight", weight, || {
@@ -182,7 +165,6 @@ fn validate_data(data: &DataConfig) -> Result<(), BadConfig> {
         return validate_synthetic(data);
     }
     check_config(data.root.is_some(), "data.root", "missing", || "write the folder of the data set or capture".into())?;
-    data.image_cache.validate().map_err(|error| error.in_section("data.image_cache"))?;
     data.filters.validate().map_err(|error| error.in_section("data.filters"))
 }
 

@@ -67,34 +67,3 @@ impl<'a> SourceText<'a> {
         text.strip_prefix("error: ").unwrap_or(&text).trim_end().to_owned()
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn rendered(file: &str, span: Range<usize>) -> String {
-        let sources = SourceText::new(Path::new("run.toml"), file, &[]);
-        sources.render(&sources.at(span, "bad name".into(), "too big".into()).with_note("help: shrink it"))
-    }
-
-    #[test]
-    fn carets_mark_each_character_of_the_span() {
-        let file = "a = 1\r\nname = \"Größe\" # x\n";
-        let start = file.find("\"Gr").unwrap();
-        let expected = "bad name
-  --> run.toml:2:8
-  |
-2 | name = \"Größe\" # x
-  |        ^^^^^^^ too big
-  |
-  = help: shrink it";
-        assert_eq!(rendered(file, start..start + 9), expected);
-    }
-
-    #[test]
-    fn spans_beyond_the_end_are_clamped() {
-        assert!(rendered("a = ", 4..4).contains("1 | a = \n  |     ^ too big"));
-        assert!(rendered("a = ", 90..99).contains("a ="));
-        assert!(rendered("", 0..0).contains("bad name"));
-    }
-}

@@ -33,7 +33,6 @@ pub(crate) fn unknown_keys(sections: &Sections, root: &DeTable, sources: &Source
     unknown.into_iter().map(|(_, diagnostic)| diagnostic).collect()
 }
 
-/// Returns title, label and help for an unknown key or section.
 fn unknown_key(sections: &Sections, section: &str, name: &str, is_section: bool) -> (String, String, String) {
     let owner_of = |section: &str| if section.is_empty() { "the top level".to_owned() } else { format!("[{section}]") };
     let place = if section.is_empty() { String::new() } else { format!(" in [{section}]") };
@@ -147,7 +146,6 @@ fn dotted_keys(text: &str) -> Vec<&str> {
     found
 }
 
-/// Returns the span of the value of a dotted key.
 fn span_of(table: &DeTable, key: &str) -> Option<Range<usize>> {
     let (first, rest) = key.split_once('.').map_or((key, None), |(first, rest)| (first, Some(rest)));
     let value = table.get(first)?;

@@ -1,7 +1,6 @@
 //! `--set key=TOML`: parses overrides and merges them into the table of the file.
 
 use std::borrow::Cow;
-use std::fmt;
 
 use codespan_reporting::diagnostic::Diagnostic;
 use toml::Spanned;
@@ -9,28 +8,9 @@ use toml::de::{DeTable, DeValue};
 
 use crate::config::diagnostic::SourceText;
 
-/// Change of a key by `--set`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Override {
-    /// Dotted key.
-    pub key: String,
-    /// Value of the file as TOML; `None` if the file does not set the key.
-    pub from: Option<String>,
-    /// New value as TOML.
-    pub to: String,
-}
-
-impl fmt::Display for Override {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { key, from, to } = self;
-        write!(f, "--set {key}: {} -> {to}", from.as_deref().unwrap_or("(default)"))
-    }
-}
-
 /// Parts of a dotted key, and the value.
 type KeyValue<'t> = (Vec<Spanned<String>>, Spanned<DeValue<'t>>);
 
-/// Splits `key=TOML` into the key's parts and the value.
 pub(crate) fn parse_override<'t>(
     sources: &SourceText,
     text: &'t str,
@@ -86,7 +66,7 @@ fn split_key(table: DeTable, depth: usize) -> KeyValue {
     (key, value)
 }
 
-/// Inserts a value and returns the former one.
+/// Inserts a value.
 ///
 /// # Errors
 /// The part of the key that is a value instead of a section.
@@ -94,40 +74,21 @@ pub(crate) fn merge_value<'t>(
     base: &mut DeTable<'t>,
     key: &[Spanned<String>],
     value: Spanned<DeValue<'t>>,
-) -> Result<Option<DeValue<'t>>, Spanned<String>> {
-    let Some((first, rest)) = key.split_first() else { return Ok(None) };
-    let name = || Spanned::new(first.span(), Cow::Owned(first.get_ref().clone()));
+) -> Result<(), Spanned<String>> {
+    let Some((first, rest)) = key.split_first() else { return Ok(()) };
+    let name = Spanned::new(first.span(), Cow::Owned(first.get_ref().clone()));
     if rest.is_empty() {
-        let old = base.remove(first.get_ref().as_str());
-        base.insert(name(), value);
-        return Ok(old.map(Spanned::into_inner));
+        base.remove(first.get_ref().as_str());
+        base.insert(name, value);
+        return Ok(());
     }
-    if !base.contains_key(first.get_ref().as_str()) {
-        base.insert(name(), Spanned::new(first.span(), DeValue::Table(DeTable::new())));
-    }
-    match base.get_mut(first.get_ref().as_str()).map(Spanned::get_mut) {
-        Some(DeValue::Table(section)) => merge_value(section, rest, value),
+    let section = base.entry(name).or_insert_with(|| Spanned::new(first.span(), DeValue::Table(DeTable::new())));
+    match section.get_mut() {
+        DeValue::Table(section) => merge_value(section, rest, value),
         _ => Err(first.clone()),
     }
 }
 
 pub(crate) fn dotted(key: &[Spanned<String>]) -> String {
     key.iter().map(|part| part.get_ref().as_str()).collect::<Vec<_>>().join(".")
-}
-
-/// Writes a value as TOML on one line.
-pub(crate) fn to_toml(value: &DeValue) -> String {
-    let list = |items: Vec<String>| items.join(", ");
-    match value {
-        DeValue::String(text) => toml::Value::String(text.to_string()).to_string(),
-        DeValue::Integer(integer) => integer.to_string(),
-        DeValue::Float(float) => float.as_str().to_owned(),
-        DeValue::Boolean(boolean) => boolean.to_string(),
-        DeValue::Datetime(datetime) => datetime.to_string(),
-        DeValue::Array(items) => format!("[{}]", list(items.iter().map(|item| to_toml(item.get_ref())).collect())),
-        DeValue::Table(table) => {
-            let entries = table.iter().map(|(key, value)| format!("{} = {}", key.get_ref(), to_toml(value.get_ref())));
-            format!("{{ {} }}", list(entries.collect()))
-        }
-    }
 }

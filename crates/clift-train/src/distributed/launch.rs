@@ -33,9 +33,6 @@ impl Launched {
     }
 
     /// Connects the processes of the launcher.
-    ///
-    /// # Errors
-    /// [`TrainError::NoMpi`] for several processes in a build without MPI, or with one that does not connect them.
     pub fn connect(self) -> Result<Ranks, TrainError> {
         if self.num_ranks > 1 { connect(self.num_ranks) } else { Ok(Ranks::single()) }
     }
@@ -43,12 +40,12 @@ impl Launched {
 
 #[cfg(feature = "mpi")]
 fn connect(num_ranks: usize) -> Result<Ranks, TrainError> {
-    use crate::distributed::communicator::Communicator;
     use crate::distributed::mpi::MpiRank;
+    use crate::distributed::ranks::Communicator;
     let found = MpiRank::start();
     let num_found = found.as_ref().map_or(0, Communicator::num_ranks);
     match found {
-        Some(rank) if num_found == num_ranks => Ok(Ranks::new(Box::new(rank))),
+        Some(rank) if num_found == num_ranks => Ok(Ranks::new(rank)),
         _ => {
             let reason = format!(
                 "MPI connects {num_found} of them: use the mpirun of the MPI that clift was built with, or `srun --mpi=pmix`"
@@ -82,13 +79,8 @@ mod tests {
         assert_eq!(launched(&[]), [0, 1]);
         assert_eq!(launched(&[("PMI_RANK", "3"), ("PMI_SIZE", "4")]), [3, 4]);
         let step = [("SLURM_STEP_NUM_TASKS", "2"), ("SLURM_PROCID", "1")];
-        assert_eq!(launched(&step), [1, 2]);
         let mpirun = [("OMPI_COMM_WORLD_SIZE", "8"), ("OMPI_COMM_WORLD_RANK", "5")];
-        assert_eq!(launched(&[step, mpirun].concat()), [5, 8], "mpirun inside a job step");
-        assert_eq!(
-            launched(&[("SLURM_PROCID", "0"), ("SLURM_NTASKS", "4")]),
-            [0, 1],
-            "a batch script is not a job step"
-        );
+        assert_eq!((launched(&step), launched(&[step, mpirun].concat())), ([1, 2], [5, 8]), "mpirun inside a job step");
+        assert_eq!(launched(&[("SLURM_PROCID", "0"), ("SLURM_NTASKS", "4")]), [0, 1], "a batch script is no job step");
     }
 }

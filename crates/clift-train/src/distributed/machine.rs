@@ -16,8 +16,6 @@ pub struct RankPlace {
     pub host: String,
     /// Number of this rank on its host, from 0.
     pub local_rank: usize,
-    /// Number of ranks on the host.
-    pub num_local: usize,
     /// Threads for a CPU device: the cores that the rank may use, divided by the ranks that may use the same ones.
     pub num_threads: usize,
 }
@@ -32,24 +30,18 @@ impl RankPlace {
         Ok(Self::of(&all, ranks.rank(), num_cores))
     }
 
-    /// Returns the place of a rank among all `(host, cores)`.
     fn of(all: &[(String, String)], rank: usize, num_cores: usize) -> Self {
         let (host, _) = &all[rank];
-        let num_local = |ranks: &[(String, String)]| ranks.iter().filter(|(other, _)| other == host).count();
         let num_sharing = all.iter().filter(|other| **other == all[rank]).count();
         Self {
             host: host.clone(),
-            local_rank: num_local(&all[..rank]),
-            num_local: num_local(all),
+            local_rank: all[..rank].iter().filter(|(other, _)| other == host).count(),
             num_threads: (num_cores / num_sharing).max(1),
         }
     }
 }
 
-/// Opens the device of this rank. Returns also the places of all ranks as text, if there are several.
-///
-/// # Errors
-/// Those of the device, and of [`Ranks::gather`].
+/// Opens the device of this rank; returns descriptions of those of all ranks, too, if there are several.
 pub(crate) fn open_device(name: DeviceName, ranks: &Ranks) -> Result<(Device, Vec<String>), TrainError> {
     if ranks.num_ranks() == 1 {
         return Ok((name.open()?, Vec::new()));
@@ -57,8 +49,8 @@ pub(crate) fn open_device(name: DeviceName, ranks: &Ranks) -> Result<(Device, Ve
     let place = RankPlace::find(ranks)?;
     let (device, adapter) = name.open_nth(place.local_rank)?;
     let text = adapter.unwrap_or_else(|| format!("{name} with {}", plural(place.num_threads, "thread")));
-    let places = ranks.gather(format!("{text} of {}", place.host))?;
-    Ok((device, (0..).zip(places).map(|(rank, text): (usize, String)| format!("rank {rank}: {text}")).collect()))
+    let all = ranks.gather(format!("{text} of {}", place.host))?;
+    Ok((device, all.into_iter().enumerate().map(|(rank, text)| format!("rank {rank}: {text}")).collect()))
 }
 
 fn host_name() -> String {
@@ -75,13 +67,12 @@ mod tests {
     fn ranks_of_a_host_share_its_cores_unless_bound() {
         let place = |all: &[(&str, &str)], rank, num_cores| {
             let all: Vec<_> = all.iter().map(|(host, cores)| ((*host).to_owned(), (*cores).to_owned())).collect();
-            let RankPlace { local_rank, num_local, num_threads, .. } = RankPlace::of(&all, rank, num_cores);
-            [local_rank, num_local, num_threads]
+            let RankPlace { local_rank, num_threads, .. } = RankPlace::of(&all, rank, num_cores);
+            [local_rank, num_threads]
         };
         let free = [("a", "0-7"), ("b", "0-7"), ("a", "0-7")];
-        assert_eq!([0, 1, 2].map(|rank| place(&free, rank, 8)), [[0, 2, 4], [0, 1, 8], [1, 2, 4]]);
-        let bound = [("a", "0"), ("a", "1")];
-        assert_eq!(place(&bound, 1, 1), [1, 2, 1]);
-        assert_eq!(place(&[("a", "0"), ("a", "0"), ("a", "0")], 2, 2), [2, 3, 1], "more ranks than cores");
+        assert_eq!([0, 1, 2].map(|rank| place(&free, rank, 8)), [[0, 4], [0, 8], [1, 4]]);
+        assert_eq!(place(&[("a", "0"), ("a", "1")], 1, 1), [1, 1]);
+        assert_eq!(place(&[("a", "0"), ("a", "0"), ("a", "0")], 2, 2), [2, 1], "more ranks than cores");
     }
 }

@@ -8,9 +8,8 @@ use mpi::environment::Universe;
 use mpi::topology::SimpleCommunicator;
 use mpi::traits::{Communicator as _, CommunicatorCollectives};
 
-use crate::distributed::communicator::Communicator;
+use crate::distributed::ranks::Communicator;
 
-/// Exit code of a process after a panic.
 const PANICKED: i32 = 101;
 
 /// A rank of `MPI_COMM_WORLD`. MPI's own errors end all ranks, its default.

@@ -19,13 +19,8 @@ pub struct BatchParts {
 impl BatchParts {
     /// Divides a batch into `accumulate` parts, and into one part for every rank if there are more ranks.
     pub fn new(batch_size: usize, accumulate: usize, ranks: &Ranks) -> Self {
-        Self::of_rank(batch_size, accumulate, ranks.rank(), ranks.num_ranks())
-    }
-
-    /// Returns the division as rank `rank` of `num_ranks` sees it.
-    pub fn of_rank(batch_size: usize, accumulate: usize, rank: usize, num_ranks: usize) -> Self {
-        let num_parts = accumulate.max(num_ranks.min(batch_size));
-        Self { batch_size, num_parts, rank, num_ranks }
+        let (rank, num_ranks) = (ranks.rank(), ranks.num_ranks());
+        Self { batch_size, num_parts: accumulate.max(num_ranks.min(batch_size)), rank, num_ranks }
     }
 
     /// Returns the scenes of the whole batch.
@@ -59,34 +54,5 @@ impl BatchParts {
     pub fn slots(&self) -> impl Iterator<Item = usize> {
         let parts = *self;
         (0..parts.num_rounds()).flat_map(move |round| parts.slots_of_round(round))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn ranks_share_the_parts_of_one_process() {
-        for (batch_size, accumulate, num_ranks) in
-            [(8, 1, 1), (8, 3, 1), (8, 1, 2), (8, 3, 2), (7, 5, 3), (8, 8, 3), (2, 1, 3), (1, 1, 4), (2, 2, 3)]
-        {
-            let ranks: Vec<BatchParts> =
-                (0..num_ranks).map(|rank| BatchParts::of_rank(batch_size, accumulate, rank, num_ranks)).collect();
-            let mut shared = Vec::new();
-            for round in 0..ranks[0].num_rounds() {
-                let slots = ranks.iter().map(|parts| parts.slots_of_round(round));
-                let working: Vec<_> = slots.filter(|slots| !slots.is_empty()).collect();
-                assert_eq!(working.len(), ranks[0].num_working(round));
-                shared.extend(working);
-            }
-            let one = BatchParts::of_rank(batch_size, ranks[0].num_parts(), 0, 1);
-            let expected: Vec<_> = (0..one.num_rounds()).map(|round| one.slots_of_round(round)).collect();
-            assert_eq!(shared, expected, "{batch_size} {accumulate} {num_ranks}");
-            assert!(shared.iter().cloned().flatten().eq(0..batch_size));
-            let mut slots: Vec<usize> = ranks.iter().flat_map(BatchParts::slots).collect();
-            slots.sort_unstable();
-            assert!(slots.into_iter().eq(0..batch_size));
-        }
     }
 }

@@ -3,8 +3,7 @@
 use std::ops::Range;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
-use crate::distributed::communicator::Communicator;
-use crate::distributed::ranks::Ranks;
+use crate::distributed::ranks::{Communicator, Ranks};
 
 /// A rank with a channel to and from every rank.
 struct ThreadRank {
@@ -69,7 +68,7 @@ pub fn on_threads<T: Send>(num_ranks: usize, work: impl Fn(Ranks) -> T + Sync) -
     }
     let work = &work;
     std::thread::scope(|scope| {
-        let start = |end: ThreadRank| scope.spawn(move || work(Ranks::new(Box::new(end))));
+        let start = |end: ThreadRank| scope.spawn(move || work(Ranks::new(end)));
         let threads: Vec<_> = ends.into_iter().map(start).collect();
         threads.into_iter().map(|thread| thread.join().expect("no rank panics")).collect()
     })

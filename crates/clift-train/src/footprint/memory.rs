@@ -1,15 +1,17 @@
 //! Peak memory of every part of a run, and a warning where the device has less.
 
-use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, VggShape, inference_bytes, update_bytes};
-
-use crate::config::config::Config;
-use crate::error::TrainError;
-use crate::events::{RunStep, Stage};
-use crate::footprint::scene_sizes::{
-    VIEWS_PER_PASS, cluster_counts, image_values, largest_sizes, measures_lpips, num_patches, num_tokens, planned_eval,
-    scene_with_all_tokens,
+use clift_eval::{EvalConfig, Method};
+use clift_model::{
+    InferenceSizes, LPIPS_MIN_SIZE_PX, Parameters, SceneSizes, Segment, UpdateSizes, VggShape, inference_bytes,
+    update_bytes,
 };
 
+use crate::config::config::{Algorithm, Config};
+use crate::error::TrainError;
+use crate::events::{RunStep, Stage};
+
+/// Target views that an evaluation renders at once.
+pub const VIEWS_PER_PASS: usize = 8;
 /// Memory of a process besides its tensors: code, threads and buffers (docs/guide/training.md).
 const PROCESS_BYTES: u64 = 20 << 20;
 
@@ -23,38 +25,23 @@ pub fn peak_bytes(config: &Config, run_step: RunStep) -> Result<u64, TrainError>
     Ok(PROCESS_BYTES + bytes as u64)
 }
 
-/// Describes the step of a run that exceeds the `available` memory the most, with a change of the config that fits;
-/// `None` if all steps fit or the available memory is unknown.
+/// Describes the step of a run that exceeds the `available` memory the most, with a change of the config; `None` if all steps
+/// fit or the available memory is unknown.
 pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<String>, TrainError> {
     let Some(available) = available else { return Ok(None) };
-    let mut largest = None;
-    for &run_step in config.run_steps() {
-        let bytes = peak_bytes(config, run_step)?;
-        if bytes > available && largest.is_none_or(|(_, most)| bytes >= most) {
-            largest = Some((run_step, bytes));
-        }
-    }
-    let Some((run_step, bytes)) = largest else { return Ok(None) };
-    let name = run_step.name();
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
-    let device = config.device;
-    let needs =
-        format!("{name} needs about {:.1} GiB, and {device} has {:.1} GiB available", gib(bytes), gib(available));
-    let RunStep::Train(stage) = run_step else {
-        return Ok(Some(format!("{needs}: fewer context views, or smaller ones, would fit")));
-    };
-    let was_on = config.activation_checkpointing;
-    for activation_checkpointing in [config.activation_checkpointing, true] {
-        let mut config = Config { activation_checkpointing, ..config.clone() };
-        let also = if activation_checkpointing && !was_on { "activation_checkpointing = true and " } else { "" };
-        for parts in 1..=config.stage(stage).batch_size {
-            config.set_accumulate(stage, parts);
-            if peak_bytes(&config, run_step)? <= available {
-                return Ok(Some(format!("{needs}: {also}{name}.accumulate = {parts} would fit")));
-            }
-        }
-    }
-    Ok(Some(format!("{needs}: even one scene at a time with activation_checkpointing = true does not fit")))
+    let peak = |&run_step: &RunStep| Ok::<_, TrainError>((peak_bytes(config, run_step)?, run_step));
+    let peaks = config.run_steps().iter().map(peak).collect::<Result<Vec<_>, _>>()?;
+    let largest = peaks.into_iter().filter(|(bytes, _)| *bytes > available).max_by_key(|(bytes, _)| *bytes);
+    Ok(largest.map(|(bytes, run_step)| {
+        let [bytes, available] = [bytes, available].map(|bytes| bytes as f64 / f64::from(1 << 30));
+        let (name, device) = (run_step.name(), config.device);
+        let more =
+            if let RunStep::Train(_) = run_step { format!("a larger {name}.accumulate, ") } else { String::new() };
+        format!(
+            "{name} needs about {bytes:.1} GiB, and {device} has {available:.1} GiB available: choose {more}fewer or \
+             smaller views"
+        )
+    }))
 }
 
 fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
@@ -76,10 +63,9 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         trained: stage.trained(),
         num_scenes,
         is_accumulated: num_scenes < settings.batch_size,
-        activation_checkpointing: config.activation_checkpointing,
         precision: config.precision,
-        matrix_moments: settings.optimizer.algorithm.matrix_moments(),
-        scene: largest_sizes(config, stage)?,
+        matrix_moments: if settings.optimizer.algorithm == Algorithm::Muon { 1 } else { 2 },
+        scene: largest_scene(config, stage)?,
         num_image_values,
         loss,
         loss_parameters: vgg.map_or(0.0, |vgg| vgg.parameters),
@@ -91,15 +77,15 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
 
 fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
     let parameters = Parameters::of(&config.model);
-    let most = num_tokens(config, config.data.views.max_context)?;
+    let scene = scene(config, config.data.views.max_context, 0)?;
     Ok(InferenceSizes {
         num_parameters: parameters.total,
         num_loaded: parameters.encoder + parameters.renderer,
-        num_encoder_rows: most,
-        num_tokens: most,
-        num_clusters: cluster_counts(config, most)?.last().copied(),
+        num_encoder_rows: scene.num_tokens,
+        num_tokens: scene.num_tokens,
+        num_clusters: Some(most_clusters(config, scene.num_tokens)?),
         num_targets: 0,
-        num_patches: num_patches(config, 1)?,
+        num_patches: config.model.num_patches(1, config.data.height, config.data.width)?,
         num_image_values: image_values(config),
         metric_working: 0.0,
         metric_parameters: 0.0,
@@ -107,27 +93,27 @@ fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
 }
 
 fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
-    let eval = &config.eval;
+    let Config { eval, data, .. } = config;
     let parameters = Parameters::of(&config.model);
-    let all = num_tokens(config, eval.num_context)?;
-    let stored = config.eval_stored_tokens().iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let supports_clusters = config.model.architecture.supports_clusters();
-    let second_renderer = if supports_clusters { parameters.renderer } else { 0 };
-    let scene = scene_with_all_tokens(config, eval.num_context, 0)?;
+    let scene = scene(config, eval.num_context, 0)?;
+    let counts = config.eval_stored_tokens().into_iter().map(|count| count.of(scene.num_tokens));
+    let stored = counts.collect::<Result<Vec<_>, _>>()?;
     let planned = planned_eval(config);
     let num_rendered: usize = stored.iter().map(|&count| planned.token_counts(count).len()).sum();
-    let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
+    let measures_lpips = eval.lpips_path().is_some() && data.width.min(data.height) >= LPIPS_MIN_SIZE_PX;
+    let vgg = measures_lpips.then(|| VggShape::VGG16.sizes(data.height, data.width));
     Ok(InferenceSizes {
         // Each of two stages has a renderer.
-        num_parameters: parameters.total + second_renderer,
+        num_parameters: parameters.total + if supports_clusters { parameters.renderer } else { 0 },
         num_loaded: parameters.condenser + parameters.renderer,
         num_encoder_rows: scene.num_encoder_rows(&config.model),
-        num_tokens: all,
+        num_tokens: scene.num_tokens,
         num_clusters: stored.iter().max().copied().filter(|_| supports_clusters),
         num_targets: eval.num_targets.min(VIEWS_PER_PASS),
-        num_patches: num_patches(config, 1)?,
+        num_patches: config.model.num_patches(1, data.height, data.width)?,
         // Images of every count and method are kept until the metrics of the scene are computed.
-        num_image_values: eval.num_targets * (num_rendered + 3) * config.data.width * config.data.height * 3,
+        num_image_values: eval.num_targets * (num_rendered + 3) * data.width * data.height * 3,
         // Features of the images, their unit vectors, and input and output of a layer; or the file of weights while it is
         // read.
         metric_working: vgg.map_or(0.0, |vgg| {
@@ -138,28 +124,65 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     })
 }
 
+/// Returns the settings of an evaluation with the methods that a run has weights for, of those of the config.
+pub fn planned_eval(config: &Config) -> EvalConfig {
+    let architecture = config.model.architecture;
+    let condensed = Method::condensed(config.clusters.grouping);
+    let mut methods = config.eval.methods.clone();
+    // The condenser of another grouping belongs to another run.
+    methods.retain(|method| !method.is_condensed() || *method == condensed);
+    if !architecture.supports_clusters() {
+        methods = vec![Method::Whole(architecture)];
+    } else if methods.is_empty() {
+        methods = vec![Method::Random, Method::Kmeans, condensed];
+    }
+    EvalConfig { methods, ..config.eval.clone() }
+}
+
+/// Returns the sizes of a scene whose target views are rendered from all its tokens.
+pub fn scene(config: &Config, num_context: usize, num_targets: usize) -> Result<SceneSizes, TrainError> {
+    Ok(SceneSizes::of(&config.model, num_context, num_targets, [config.data.height, config.data.width])?)
+}
+
+pub fn largest_scene(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {
+    let views = &config.data.views;
+    let scene = scene(config, views.max_context, views.num_targets)?;
+    if stage == Stage::Stage2 {
+        let most = most_clusters(config, scene.num_tokens)?;
+        return Ok(SceneSizes { num_storage_tokens: Some(most), num_render_tokens: most, ..scene });
+    }
+    let [low, high] = config.stage1.keep_tokens;
+    let kept = ((scene.num_tokens as f64 * high) as usize).max(1);
+    // Views share the tokens only if all are kept; with one token less, every view has its own subset.
+    let is_per_view = low < 1.0;
+    let num_render_tokens = if is_per_view { kept.min((scene.num_tokens - 1).max(1)) } else { kept };
+    Ok(SceneSizes { num_render_tokens, is_per_view, ..scene })
+}
+
+pub fn most_clusters(config: &Config, num_tokens: usize) -> Result<usize, TrainError> {
+    let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
+    Ok(counts.collect::<Result<Vec<_>, _>>()?.into_iter().max().unwrap_or(num_tokens))
+}
+
+/// Returns the number of values of all images of the largest training scene.
+fn image_values(config: &Config) -> usize {
+    let views = &config.data.views;
+    (views.max_context + views.num_targets) * config.data.height * config.data.width * 3
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn warning_names_the_smallest_change_that_fits() {
+    fn warning_names_the_largest_step() {
         let mut config = Config { run_dir: "run".into(), ..Config::default() };
         (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
-        config.data.views.max_context = 4;
-        let peak = |config: &Config, stage: Stage| peak_bytes(config, stage.into()).expect("valid");
-        let warning = |available: u64| memory_warning(&config, Some(available)).expect("valid");
-        assert_eq!(warning(u64::MAX), None);
+        let most =
+            config.run_steps().iter().map(|step| peak_bytes(&config, *step).expect("valid")).max().expect("steps");
         assert_eq!(memory_warning(&config, None).expect("valid"), None);
-        let most = peak(&config, Stage::Stage1).max(peak(&config, Stage::Stage2));
-        let text = warning(most - 1).expect("one part is too large");
-        assert!(text.contains(".accumulate = 2 would fit"), "{text}");
-        // Less than stage 2, the largest, takes scene by scene.
-        let mut one_by_one = config.clone();
-        one_by_one.stage2.accumulate = config.stage2.batch_size;
-        let text = warning(peak(&one_by_one, Stage::Stage2) - 1).expect("too large");
-        assert!(text.contains("activation_checkpointing = true and stage"), "{text}");
-        let text = warning(1 << 20).expect("too large");
-        assert!(text.ends_with("even one scene at a time with activation_checkpointing = true does not fit"), "{text}");
+        assert_eq!(memory_warning(&config, Some(most)).expect("valid"), None);
+        let text = memory_warning(&config, Some(most - 1)).expect("valid").expect("one step is too large");
+        assert!(text.starts_with("stage") && text.contains("a larger stage"), "{text}");
     }
 }

@@ -5,8 +5,7 @@ use std::collections::BTreeMap;
 use clift_data::StateDict;
 use clift_model::{CliftVariant, InferredConfig, PERCEPTUAL_PREFIX, PREFIX, canonical_key, infer_config};
 
-use crate::error::{TrainError, bad};
-use crate::interchange::record::ImportOptions;
+use crate::error::TrainError;
 
 /// Most characters of a key in a message.
 const MAX_SHOWN: usize = 160;
@@ -17,10 +16,7 @@ const MAX_OUTSIDE: usize = 200;
 pub(crate) struct Keys {
     /// Keys of the network: canonical name to name in the file.
     pub network: BTreeMap<String, String>,
-    /// Prefix of these keys in the file.
     pub prefix: &'static str,
-    /// Keys that look like those of the network but lack the prefix, as above.
-    pub strays: BTreeMap<String, String>,
     /// First parts of keys that are known not to belong to the network, with their numbers.
     pub ignored: BTreeMap<String, usize>,
     /// Patterns of unknown keys outside the network, with their numbers.
@@ -28,27 +24,8 @@ pub(crate) struct Keys {
 }
 
 impl Keys {
-    /// Classifies the keys of a checkpoint after renaming.
-    pub fn of(state: &StateDict, options: &ImportOptions) -> Result<Self, TrainError> {
-        let mut is_used = vec![false; options.renames.len()];
-        let mut all = Vec::new();
-        for key in state.keys() {
-            let mut name = key.to_owned();
-            for ((from, to), is_used) in options.renames.iter().zip(&mut is_used) {
-                if name.contains(from) {
-                    *is_used = true;
-                    name = name.replace(from, to);
-                }
-            }
-            all.push((canonical_key(&name), key));
-        }
-        if let Some(((from, to), _)) = options.renames.iter().zip(&is_used).find(|(_, is_used)| !**is_used) {
-            let first = all.first().map_or("none", |(_, key)| key);
-            let fix =
-                format!("no key contains {from:?}; the first key is {}: {}", printable(first), state.path.display());
-            return Err(bad("--rename", format!("{from}={to}"), &fix));
-        }
-
+    pub fn of(state: &StateDict) -> Result<Self, TrainError> {
+        let all: Vec<(String, &str)> = state.keys().map(|key| (canonical_key(key), key)).collect();
         // A state dict of the network alone has no prefix.
         let prefix = if all.iter().any(|(name, _)| name.starts_with(PREFIX)) { PREFIX } else { "" };
         let mut keys = Self { prefix, ..Self::default() };
@@ -60,8 +37,6 @@ impl Keys {
                     let reason = format!("{} and {} are both {}", printable(&other), printable(key), printable(plain));
                     return Err(TrainError::bad_file("checkpoint", &state.path)(reason));
                 }
-            } else if starts_as_network(&name) {
-                keys.strays.insert(name, key.to_owned());
             } else {
                 let pattern = printable(&pattern(key));
                 let is_known = keys.outside.contains_key(&pattern) || keys.outside.len() < MAX_OUTSIDE;
@@ -75,14 +50,6 @@ impl Keys {
         let shape = |key: &str| state.tensor(key).map_or(&[][..], |(_, shape)| shape);
         infer_config(variant, num_heads, self.network.iter().map(|(name, key)| (name.as_str(), shape(key))))
     }
-}
-
-/// Whether a key without the prefix probably belongs to the network.
-fn starts_as_network(name: &str) -> bool {
-    let first = name.split('.').next().unwrap_or_default();
-    matches!(first, "encoder" | "decoder" | "squeezer" | "patch_to_image")
-        || first.starts_with("linear_")
-        || first.ends_with("_norm")
 }
 
 fn is_number(part: &str) -> bool {

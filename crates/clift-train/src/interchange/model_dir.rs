@@ -2,17 +2,16 @@
 
 use std::collections::HashMap;
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
 
 use clift_core::{PoseRotation, PoseScale, TEMPORARY, folder_of, publish_folder, replace_file};
 use clift_data::SourceKind;
 use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
-use clift_scene::TokenCodec;
+use safetensors::SafeTensorError;
 use safetensors::tensor::{Dtype, TensorView};
+use serde::Serialize;
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
-use crate::interchange::record::{ImportRecord, check_stop};
 
 /// Name, shape and row-major values of a tensor in PyTorch's layout, as [`clift_data::write_state_dict`] takes it.
 pub type HostTensor = (String, Vec<usize>, Vec<f32>);
@@ -48,40 +47,35 @@ pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     Err(bad("-o", path.display(), "the path exists and is not overwritten; write another one"))
 }
 
-/// Writes the model directory of an import and opens the model to check it. Removes all files if `stop` is set before.
+/// Writes the model directory of an import under a temporary name, opens the model to check it, and renames the directory.
+/// Removes all files on errors.
 pub(crate) fn write_model_dir(
     folder: &Path,
     config: &Config,
     parameters: &[HostTensor],
-    (imported, file): (&ImportRecord, &Path),
-    stop: &AtomicBool,
+    imported: &impl Serialize,
 ) -> Result<(), TrainError> {
     publish_model_dir(folder, |written| {
-        let bytes = to_safetensors(parameters, HashMap::new(), folder)?;
-        check_stop(stop)?;
-        write_file(&written.weights, &bytes)?;
+        let write = |path: &Path, bytes: &[u8]| replace_file(path, bytes).map_err(TrainError::io(WRITING, path));
+        let bytes = to_safetensors(parameters).map_err(TrainError::bad_file("weight file", folder))?;
+        write(&written.weights, &bytes)?;
         drop(bytes);
-        check_stop(stop)?;
         let config_text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", folder))?;
-        write_file(&written.dir.join("config.toml"), config_text.as_bytes())?;
+        write(&written.dir.join("config.toml"), config_text.as_bytes())?;
         let import_text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", folder))?;
-        write_file(&written.dir.join("import.json"), &import_text)?;
-        let model = TrainedModel::open_with(written, &config.model, &config.device.open()?)?;
-        if let Some(codec) = TokenCodec::beside(file, &model)? {
-            codec.write(&TokenCodec::path_of(&written.weights))?;
-        }
-        check_stop(stop)
+        write(&written.dir.join("import.json"), &import_text)?;
+        TrainedModel::open_with(written, &config.model, &config.device.open()?)?;
+        Ok(())
     })
 }
 
 const WRITING: &str = "writing the model directory";
 
-/// Makes a directory under a temporary name, has `fill` write its files, and renames it. Removes it on errors. Returns the
-/// result of `fill`.
-pub(crate) fn publish_model_dir<T>(
+/// Makes a directory under a temporary name, has `fill` write its files, and renames it. Removes it on errors.
+pub(crate) fn publish_model_dir(
     folder: &Path,
-    fill: impl FnOnce(&ModelPath) -> Result<T, TrainError>,
-) -> Result<T, TrainError> {
+    fill: impl FnOnce(&ModelPath) -> Result<(), TrainError>,
+) -> Result<(), TrainError> {
     if folder.file_name().is_none() {
         return Err(bad("-o", folder.display(), "write the name of a directory"));
     }
@@ -93,33 +87,23 @@ pub(crate) fn publish_model_dir<T>(
     // Removed on drop.
     let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
     let temporary = temporary.map_err(TrainError::io(WRITING, above))?;
-    let filled =
-        fill(&ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") })?;
+    fill(&ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") })?;
     require_absent(folder)?;
     publish_folder(temporary.path(), folder).map_err(TrainError::io(WRITING, folder))?;
     let _ = temporary.keep(); // the directory was renamed
-    Ok(filled)
+    Ok(())
 }
 
-pub(crate) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), TrainError> {
-    replace_file(path, bytes).map_err(TrainError::io(WRITING, path))
-}
-
-pub(crate) fn to_safetensors(
-    tensors: &[HostTensor],
-    mut metadata: HashMap<String, String>,
-    path: &Path,
-) -> Result<Vec<u8>, TrainError> {
-    let bad = |error: safetensors::SafeTensorError| TrainError::bad_file("weight file", path)(error);
+fn to_safetensors(tensors: &[HostTensor]) -> std::io::Result<Vec<u8>> {
     let to_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
     let bytes: Vec<Vec<u8>> = tensors.iter().map(|(_, _, values)| to_bytes(values)).collect();
     let views = tensors
         .iter()
         .zip(&bytes)
         .map(|((name, shape, _), bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
-        .collect::<Result<Vec<_>, _>>();
-    metadata.insert("format".into(), "clift-1".into());
-    let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
+        .collect::<Result<Vec<_>, SafeTensorError>>();
+    let metadata = HashMap::from([("format".to_owned(), "clift-1".to_owned())]);
+    let file = views.and_then(|views| safetensors::serialize(views, Some(metadata))).map_err(std::io::Error::other)?;
     // Equal weights give equal files.
-    sorted_header(file).map_err(TrainError::bad_file("weight file", path))
+    sorted_header(file)
 }

@@ -6,7 +6,7 @@ use clift_eval::Summary;
 
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
-use crate::run::lock::{LOCK, LockedFolder, RunLock, has_other_files};
+use crate::run::lock::{EVALUATION, LOCK, RunLock, has_other_files};
 
 /// The file that every evaluation writes.
 pub(crate) const SUMMARY: &str = "summary.json";
@@ -14,11 +14,20 @@ pub(crate) const SUMMARY: &str = "summary.json";
 /// Files that are replaced on request only.
 const RESULTS: [&str; 4] = [SUMMARY, "scenes.csv", "views.csv", "report.html"];
 
-/// An output folder, locked until it is dropped: no other process evaluates into it.
+/// An output folder, locked until it is dropped: no other process evaluates into it. A new folder without results goes again.
 #[derive(Debug)]
 pub struct EvalFolder {
     path: PathBuf,
-    _lock: Option<RunLock>,
+    _lock: RunLock,
+    is_new: bool,
+}
+
+impl Drop for EvalFolder {
+    fn drop(&mut self) {
+        if self.is_new && has_other_files(&self.path).is_ok_and(|has_results| !has_results) {
+            drop(std::fs::remove_file(self.path.join(LOCK)).and_then(|()| std::fs::remove_dir(&self.path)));
+        }
+    }
 }
 
 impl EvalFolder {
@@ -38,14 +47,9 @@ impl EvalFolder {
         if !replace && RESULTS.into_iter().any(has) {
             return refuse("the folder holds an evaluation; replace it with --force, or set another --out");
         }
+        let is_new = !path.exists();
         std::fs::create_dir_all(path).map_err(TrainError::io("making a folder", path))?;
-        let lock = RunLock::take(path, LockedFolder::Evaluation, sink)?;
-        Ok(Self { path: path.into(), _lock: Some(lock) })
-    }
-
-    /// Returns the folder of a rank that does not write.
-    pub(crate) fn unlocked(path: PathBuf) -> Self {
-        Self { path, _lock: None }
+        Ok(Self { path: path.into(), _lock: RunLock::take(path, EVALUATION, sink)?, is_new })
     }
 
     /// Returns the path of the folder.
@@ -84,7 +88,10 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let out = place.path().join("eval");
         drop(open(&out, false).unwrap());
+        assert!(!out.exists(), "a new folder without results goes again");
+        let new = open(&out, false).unwrap();
         std::fs::write(out.join(SUMMARY), "{}").unwrap();
+        drop(new);
         let message = open(&out, false).unwrap_err().to_string();
         assert!(message.contains("`--out` = ") && message.contains("--force"), "{message}");
         open(&out, true).unwrap();
@@ -99,15 +106,13 @@ mod tests {
     #[test]
     fn folders_of_other_files_are_refused_unchanged() {
         let place = tempfile::tempdir().unwrap();
-        for (name, file) in [("table", "views.csv"), ("letters", "letter.txt"), ("run", "run.json")] {
-            let folder = place.path().join(name);
+        for file in ["views.csv", "letter.txt", "run.json"] {
+            let folder = place.path().join(format!("folder of {file}"));
             std::fs::create_dir(&folder).unwrap();
             std::fs::write(folder.join(file), "mine").unwrap();
-            for replace in [false, true] {
-                let message = open(&folder, replace).unwrap_err().to_string();
-                assert!(message.contains("is not an evaluation; set another --out"), "{message}");
-            }
-            assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1, "no lock stays in {name}");
+            let message = open(&folder, true).unwrap_err().to_string();
+            assert!(message.contains("is not an evaluation; set another --out"), "{message}");
+            assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1, "no lock stays beside {file}");
         }
     }
 

@@ -10,12 +10,12 @@ use clift_model::{ModelConfig, ModelError, ModelPath, TrainedModel};
 use clift_scene::TokenCodec;
 
 use crate::config::config::Config;
-use crate::distributed::ranks::Ranks;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
-use crate::run::validation::{EvalRequest, Validation};
+use crate::run::eval_folder::EvalFolder;
+use crate::run::validation::Validation;
 
-/// Evaluates a model with the data and settings of `config`.
+/// Evaluates a model on a split of the data of `config`, and writes the results to a folder.
 ///
 /// A model with a condenser is measured on condensed tokens only, unless `stage1` is given: the model it was trained from,
 /// which renders the other methods.
@@ -29,7 +29,7 @@ pub fn evaluate_model(
     mut config: Config,
     model: &ModelPath,
     stage1: Option<&ModelPath>,
-    request: &EvalRequest,
+    (split, folder): (Split, &EvalFolder),
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<Summary, TrainError> {
@@ -60,7 +60,6 @@ pub fn evaluate_model(
         models.codec = TokenCodec::beside(&model.weights, &last)?.map(Arc::new);
         models.set_stage2(config.clusters.grouping, last);
     }
-    let split = request.split;
     let opened = open_dataset(&config.data, split, &mut |done, total| sink.event(&Event::Scan { done, total }))?;
     sink.event(&Event::Message(format!("{split}: {}", opened.report)));
     let mut frames = EvalFrames::new(&opened, split, 0, false);
@@ -69,8 +68,8 @@ pub fn evaluate_model(
     }
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     let mut validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
-    validation.check_contexts();
-    validation.evaluate(&models, request, &Ranks::single(), stop, sink)
+    validation.evaluator.sweep.checks_contexts = true;
+    validation.evaluate(&models, folder, stop, sink)
 }
 
 /// Opens the stage-2 model of the run of `config`, which must be trained on the encoder of `stage1`.

@@ -1,14 +1,15 @@
 //! Initial weights of a stage from another model, and weights between those and the trained ones.
 
+use std::collections::VecDeque;
 use std::path::Path;
 
-use burn::module::Module;
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::tensor::Tensor;
 use clift_model::{ModelPath, Network, NetworkAdapter, check_condenser, find_shipped, load_adapted, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
-use crate::stage::interpolation::interpolate;
 
 /// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
 /// the same stage of another run, from a model directory, a weight file or the [shipped model](find_shipped), maybe through a
@@ -84,6 +85,37 @@ pub(crate) fn stage2_weights(
         "stage2: saving the weights at {position} of the way from its start; checkpoints and validations have those at its end"
     )));
     Ok(interpolate(&start, trained, *position))
+}
+
+/// Returns `start + position * (trained - start)` for every parameter of two modules with the same parameters (WiSE-FT,
+/// Wortsman et al., CVPR 2022): on images unlike those of the training, weights in between are often better than both. Equal
+/// values stay equal bit for bit, -0 too.
+fn interpolate<M: Module>(start: &M, trained: M, position: f64) -> M {
+    let mut interpolation = Interpolation { start: VecDeque::new(), position };
+    start.visit(&mut interpolation);
+    trained.map(&mut interpolation)
+}
+
+struct Interpolation {
+    /// Parameters in the module's order, flattened.
+    start: VecDeque<Tensor<1>>,
+    position: f64,
+}
+
+impl ModuleVisitor for Interpolation {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        self.start.push_back(param.val().flatten(0, D - 1));
+    }
+}
+
+impl ModuleMapper for Interpolation {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let start = self.start.pop_front().expect("modules with the same parameters");
+        param.map(|trained| {
+            let start = start.reshape(trained.dims());
+            trained.clone() - (trained - start).mul_scalar(1.0 - self.position)
+        })
+    }
 }
 
 #[cfg(test)]

@@ -9,30 +9,17 @@ use clift_core::TEMPORARY;
 use crate::error::TrainError;
 use crate::events::{Event, Sink};
 
-/// A folder that only one process may write to.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum LockedFolder {
-    /// The directory of a run that is trained.
-    Run,
-    /// The directory of a run that is evaluated into it.
-    EvaluatedRun,
-    /// The directory of a run whose codec is fitted.
-    FittedRun,
-    /// The output folder of an evaluation.
-    Evaluation,
-}
+/// What a locked folder is, and where else to write.
+pub(crate) type LockedFolder = (&'static str, &'static str);
 
-impl LockedFolder {
-    /// Returns what the folder is, and where else to write.
-    const fn describe(self) -> (&'static str, &'static str) {
-        match self {
-            Self::Run => ("run directory", "another `run_dir`"),
-            Self::EvaluatedRun => ("run directory", "an --out outside of it"),
-            Self::FittedRun => ("run directory", "another model"),
-            Self::Evaluation => ("output folder", "another --out"),
-        }
-    }
-}
+/// The directory of a run that is trained.
+pub(crate) const RUN: LockedFolder = ("run directory", "another `run_dir`");
+/// The directory of a run that is evaluated into it.
+pub(crate) const EVALUATED_RUN: LockedFolder = ("run directory", "an --out outside of it");
+/// The directory of a run whose codec is fitted.
+pub(crate) const FITTED_RUN: LockedFolder = ("run directory", "another model");
+/// The output folder of an evaluation.
+pub(crate) const EVALUATION: LockedFolder = ("output folder", "another --out");
 
 /// Name of the lock in its folder.
 pub(crate) const LOCK: &str = "lock";
@@ -65,10 +52,11 @@ impl Drop for RunLock {
 
 impl RunLock {
     /// Locks the existing `folder`. A file system without locks gives a warning only.
-    ///
-    /// # Errors
-    /// [`TrainError::Locked`] if another process has the lock, [`TrainError::Io`] if the file cannot be opened.
-    pub(crate) fn take(folder: &Path, kind: LockedFolder, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+    pub(crate) fn take(
+        folder: &Path,
+        (what, elsewhere): LockedFolder,
+        sink: &mut dyn Sink,
+    ) -> Result<Self, TrainError> {
         let path = folder.join(LOCK);
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
         let mut file = opened.map_err(TrainError::io("opening the lock of the folder", &path))?;
@@ -83,12 +71,10 @@ impl RunLock {
                 let _ = file.rewind().and_then(|()| file.read_to_string(&mut holder));
                 let is_id = !holder.is_empty() && holder.bytes().all(|byte| byte.is_ascii_digit());
                 let holder = if is_id { format!("process {holder}") } else { "another process".into() };
-                let (what, elsewhere) = kind.describe();
                 return Err(TrainError::Locked { what, holder, elsewhere, path: folder.into() });
             }
             Err(TryLockError::Error(error)) => {
-                let text =
-                    format!("the {} cannot be locked, do not start a second process in it: {error}", kind.describe().0);
+                let text = format!("the {what} cannot be locked, do not start a second process in it: {error}");
                 sink.event(&Event::Warning(text));
             }
         }

@@ -14,14 +14,12 @@ use crate::events::{Event, Sink, Stage, StepEvent};
 use crate::step::step_guard::SkippedStep;
 
 /// A file of JSON lines, at most one per step. Every line is flushed; a killed run loses at most the last one.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct StepLines {
-    path: PathBuf,
-    /// Opened by the first line.
+    /// `None` on a rank other than 0, where no lines are written.
+    path: Option<PathBuf>,
     file: Option<File>,
     failure: Option<std::io::Error>,
-    /// Whether lines are dropped.
-    is_silent: bool,
 }
 
 impl StepLines {
@@ -37,40 +35,34 @@ impl StepLines {
         if path.exists() {
             truncate_after(path, stage, step)?;
         }
-        Ok(Self { path: path.to_owned(), file: None, failure: None, is_silent: false })
-    }
-
-    /// Returns lines that are not written, of a rank other than 0.
-    fn silent() -> Self {
-        Self { path: PathBuf::new(), file: None, failure: None, is_silent: true }
+        Ok(Self { path: Some(path.into()), ..Self::default() })
     }
 
     /// Appends a line. A failure is kept for [`StepLines::check`]; later lines are not written.
     pub fn write(&mut self, line: &impl Serialize) {
-        if self.failure.is_none() && !self.is_silent {
+        if self.failure.is_none() {
             self.failure = self.try_write(line).err();
         }
     }
 
     fn try_write(&mut self, line: &impl Serialize) -> std::io::Result<()> {
+        let Some(path) = &self.path else { return Ok(()) };
         let file = match &mut self.file {
             Some(file) => file,
-            none => none.insert(OpenOptions::new().create(true).append(true).open(&self.path)?),
+            // The first line makes the file.
+            none => none.insert(OpenOptions::new().create(true).append(true).open(path)?),
         };
         // One write per line: a kill tears at most the last one.
         file.write_all(format!("{}\n", serde_json::to_string(line)?).as_bytes())
     }
 
     /// Flushes all lines to the disk, or returns the first failure to write a line.
-    pub fn check(&mut self) -> std::io::Result<()> {
-        if let Some(failure) = self.failure.take() {
-            return Err(failure);
-        }
-        self.file.as_ref().map_or(Ok(()), File::sync_data)
-    }
-
-    pub fn path(&self) -> &Path {
-        &self.path
+    pub fn check(&mut self) -> Result<(), TrainError> {
+        let flushed = match self.failure.take() {
+            Some(failure) => Err(failure),
+            None => self.file.as_ref().map_or(Ok(()), File::sync_data),
+        };
+        flushed.map_err(TrainError::io("writing the log of steps", self.path.as_deref().unwrap_or(Path::new(""))))
     }
 }
 
@@ -117,7 +109,6 @@ pub struct SkipLine {
 struct StepLine<'a> {
     #[serde(flatten)]
     step: &'a StepEvent,
-    /// Seconds since 1970, UTC.
     time: f64,
 }
 
@@ -126,12 +117,10 @@ struct StepLine<'a> {
 struct ValidationLine {
     step: u64,
     stage: Stage,
-    /// Mean over views, in dB.
     psnr: f64,
     /// `null` for images below 11 pixels.
     ssim: Option<f64>,
     num_views: usize,
-    /// Seconds since 1970, UTC.
     time: f64,
 }
 
@@ -148,7 +137,6 @@ pub struct RunLog<'a> {
     validations: StepLines,
     bad_steps: StepLines,
     skips: StepLines,
-    /// Scenes that have a line.
     skipped: HashSet<String>,
 }
 
@@ -165,8 +153,8 @@ impl<'a> RunLog<'a> {
             let path = run_dir.join(name);
             StepLines::open(&path, stage, step).map_err(TrainError::io("opening the log of steps", &path))
         };
-        let skips = open("skipped.jsonl", step)?;
-        let skipped = read_skips(skips.path()).map_err(TrainError::io("reading the log of scenes", skips.path()))?;
+        let (skips, path) = (open("skipped.jsonl", step)?, run_dir.join("skipped.jsonl"));
+        let skipped = read_skips(&path).map_err(TrainError::io("reading the log of scenes", &path))?;
         // A validation after the last saved one is made again.
         let (metrics, validations) = (open("metrics.jsonl", step)?, open("validation.jsonl", validated)?);
         Ok(Self { sink, metrics, validations, bad_steps: open("bad_steps.jsonl", step)?, skips, skipped })
@@ -174,7 +162,7 @@ impl<'a> RunLog<'a> {
 
     /// Returns a log that only passes events on, of a rank other than 0.
     pub fn silent(sink: &'a mut dyn Sink) -> Self {
-        let [metrics, validations, bad_steps, skips] = std::array::from_fn(|_| StepLines::silent());
+        let [metrics, validations, bad_steps, skips] = std::array::from_fn(|_| StepLines::default());
         Self { sink, metrics, validations, bad_steps, skips, skipped: HashSet::new() }
     }
 
@@ -193,13 +181,12 @@ impl<'a> RunLog<'a> {
     /// Flushes all lines to the disk. Must succeed before a checkpoint is saved, or a resumed run would lack lines.
     pub fn check(&mut self) -> Result<(), TrainError> {
         for lines in [&mut self.metrics, &mut self.validations, &mut self.bad_steps, &mut self.skips] {
-            lines.check().map_err(TrainError::io("writing the log of steps", lines.path()))?;
+            lines.check()?;
         }
         Ok(())
     }
 }
 
-/// Reads the keys of the scenes that have a line.
 fn read_skips(path: &Path) -> std::io::Result<HashSet<String>> {
     if !path.exists() {
         return Ok(HashSet::new());
@@ -224,40 +211,33 @@ impl Sink for RunLog<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::step::step_guard::StepAnomaly;
 
-    const STEP: StepEvent = StepEvent {
-        step: 1,
-        stage: Stage::Stage1,
-        last_step: 9,
-        last_step_of_size: 9,
-        loss: f64::NAN,
-        psnr: f64::INFINITY,
-        lr: 1e-3,
-        grad_norm: 2.0,
-        step_s: 0.25,
-        images_per_s: 48.0,
-        peak_bytes: None,
-    };
+    const ONE: Stage = Stage::Stage1;
+    const TWO: Stage = Stage::Stage2;
 
-    #[derive(Default)]
-    struct Count(usize);
-
-    impl Sink for Count {
-        fn event(&mut self, _event: &Event) {
-            self.0 += 1;
-        }
+    fn step(stage: Stage, step: u64) -> Event {
+        Event::Step(StepEvent {
+            step,
+            stage,
+            last_step: 9,
+            loss: f64::NAN,
+            psnr: f64::INFINITY,
+            lr: 1e-3,
+            grad_norm: 2.0,
+            step_s: 0.25,
+            images_per_s: 48.0,
+            peak_bytes: None,
+        })
     }
 
-    /// Writes steps to `metrics.jsonl` of a run that resumes at `from`.
-    fn write(path: &Path, from: (Stage, u64), steps: &[(Stage, u64)]) {
-        let mut count = Count::default();
-        let mut log = RunLog::open(path.parent().unwrap(), from.0, [from.1; 2], &mut count).unwrap();
-        for &(stage, step) in steps {
-            log.event(&Event::Step(StepEvent { step, stage, ..STEP }));
-        }
+    /// Writes to the logs of a run that resumes at a step and its last validation. Returns the number of events passed on.
+    fn log(folder: &Path, (stage, from): (Stage, [u64; 2]), write: impl FnOnce(&mut RunLog)) -> usize {
+        let mut count = 0;
+        let mut sink = |_: &Event| count += 1;
+        let mut log = RunLog::open(folder, stage, from, &mut sink).unwrap();
+        write(&mut log);
         log.check().unwrap();
-        assert_eq!(count.0, steps.len(), "events are passed on");
+        count
     }
 
     fn steps(path: &Path) -> Vec<(Stage, u64)> {
@@ -267,126 +247,79 @@ mod tests {
     }
 
     #[test]
-    fn lines_have_documented_names_and_null_for_non_finite_values() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut count = Count::default();
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, [0; 2], &mut count).unwrap();
-        log.event(&Event::Message("not a step".into()));
-        log.event(&Event::Step(STEP));
-        let bad = |step| SkippedStep {
-            step,
-            stage: Stage::Stage1,
-            reason: StepAnomaly::LossSpike,
-            loss: Some(2.0),
-            grad_norm: None,
-            median_loss: Some(0.5),
-            median_grad_norm: Some(1.0),
-            in_a_row: 1,
-            scenes: Vec::new(),
-        };
-        assert!(!folder.path().join("bad_steps.jsonl").exists(), "made by the first skipped step");
-        log.bad_step(&bad(3));
-        log.bad_step(&bad(5));
-        // Before `check`: every line is flushed. Resuming after step 4 drops the line of step 5.
-        RunLog::open(folder.path(), Stage::Stage1, [4; 2], &mut Count::default()).unwrap();
-        let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
-        let text = read("metrics.jsonl");
-        let (line, time) = text.split_once(",\"time\":").unwrap();
-        assert_eq!(
-            line,
-            "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25,\"images_per_s\":48.0,\"peak_bytes\":null"
-        );
-        let time: f64 = time.trim_end_matches("}\n").parse().unwrap();
-        assert!((now() - time).abs() < 60.0, "{time}");
-        assert_eq!(
-            read("bad_steps.jsonl"),
-            "{\"step\":3,\"stage\":\"stage1\",\"reason\":\"loss_spike\",\"loss\":2.0,\"grad_norm\":null,\
-             \"median_loss\":0.5,\"median_grad_norm\":1.0,\"in_a_row\":1,\"scenes\":[]}\n"
-        );
-    }
-
-    #[test]
     fn resuming_drops_later_steps_and_torn_lines() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
-        let (one, two) = (Stage::Stage1, Stage::Stage2);
-        write(&path, (one, 0), &[(one, 1), (one, 2), (one, 3), (two, 1), (two, 2)]);
-        write(&path, (two, 1), &[(two, 2)]);
-        assert_eq!(steps(&path), [(one, 1), (one, 2), (one, 3), (two, 1), (two, 2)]);
-        write(&path, (one, 2), &[(one, 3)]);
-        assert_eq!(steps(&path), [(one, 1), (one, 2), (one, 3)]);
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        let write = |stage, from, lines: &[(Stage, u64)]| {
+            let passed = log(folder.path(), (stage, [from; 2]), |log| {
+                for &(stage, number) in lines {
+                    log.event(&step(stage, number));
+                }
+            });
+            assert_eq!(passed, lines.len(), "events are passed on");
+        };
+        write(ONE, 0, &[(ONE, 1), (ONE, 2), (ONE, 3), (TWO, 1), (TWO, 2)]);
+        write(TWO, 1, &[(TWO, 2)]);
+        assert_eq!(steps(&path), [(ONE, 1), (ONE, 2), (ONE, 3), (TWO, 1), (TWO, 2)]);
+        write(ONE, 2, &[(ONE, 3)]);
+        let three = [(ONE, 1), (ONE, 2), (ONE, 3)];
+        assert_eq!(steps(&path), three);
         let without_newline = "{\"step\":2,\"stage\":\"stage1\"}";
         for torn in ["{\"step\":2,\"sta", "{\"step\":2,\"sta\n", "\u{0}\u{0}", without_newline] {
             let whole = std::fs::read_to_string(&path).unwrap();
             std::fs::write(&path, whole + torn).unwrap();
-            write(&path, (one, 5), &[]);
-            assert_eq!(steps(&path), [(one, 1), (one, 2), (one, 3)]);
+            write(ONE, 5, &[]);
+            assert_eq!(steps(&path), three);
         }
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        // A file of another program is left alone.
+        std::fs::write(&path, "a diary\nof days\n").unwrap();
+        assert_eq!(StepLines::open(&path, ONE, 0).unwrap_err().to_string(), "line 1 has no step");
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "a diary\nof days\n");
     }
 
     #[test]
     fn validations_after_the_saved_one_are_made_again() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("validation.jsonl");
-        let mut count = Count::default();
-        let validation =
-            |step, psnr| Event::Evaluated { stage: Stage::Stage1, step, psnr, ssim: Some(0.5), num_views: 3 };
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, [0; 2], &mut count).unwrap();
-        for (step, psnr) in [(2, 20.5), (4, f64::NAN), (6, 21.0)] {
-            log.event(&validation(step, psnr));
-        }
-        log.check().unwrap();
-        assert!(
-            std::fs::read_to_string(&path)
-                .unwrap()
-                .starts_with("{\"step\":2,\"stage\":\"stage1\",\"psnr\":20.5,\"ssim\":0.5,\"num_views\":3,\"time\":")
-        );
-        assert_eq!(steps(&path), [(Stage::Stage1, 2), (Stage::Stage1, 6)], "a result without value is none");
+        log(folder.path(), (ONE, [0; 2]), |log| {
+            for (step, psnr) in [(2, 20.5), (4, f64::NAN), (6, 21.0)] {
+                log.event(&Event::Evaluated { stage: ONE, step, psnr, ssim: Some(0.5), num_views: 3 });
+            }
+        });
+        let text = std::fs::read_to_string(&path).unwrap();
+        let first = "{\"step\":2,\"stage\":\"stage1\",\"psnr\":20.5,\"ssim\":0.5,\"num_views\":3,\"time\":";
+        assert!(text.starts_with(first), "{text}");
+        assert_eq!(steps(&path), [(ONE, 2), (ONE, 6)], "a result without value is none");
         // The checkpoint of step 6 was saved before its validation.
-        RunLog::open(folder.path(), Stage::Stage1, [6, 2], &mut count).unwrap();
-        assert_eq!(steps(&path), [(Stage::Stage1, 2)]);
-    }
-
-    #[test]
-    fn foreign_files_are_left_alone() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("metrics.jsonl");
-        std::fs::write(&path, "a diary\nof days\n").unwrap();
-        let error = StepLines::open(&path, Stage::Stage1, 0).unwrap_err();
-        assert_eq!(error.to_string(), "line 1 has no step");
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), "a diary\nof days\n");
+        log(folder.path(), (ONE, [6, 2]), |_| {});
+        assert_eq!(steps(&path), [(ONE, 2)]);
     }
 
     #[test]
     fn write_failure_is_reported_and_ends_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("missing/metrics.jsonl");
-        let mut lines = StepLines::open(&path, Stage::Stage1, 0).unwrap();
+        let mut lines = StepLines::open(&path, ONE, 0).unwrap();
         lines.write(&1);
         std::fs::create_dir(folder.path().join("missing")).unwrap();
         lines.write(&2);
         assert!(!path.exists(), "a file with a gap would look complete");
-        assert_eq!(lines.check().unwrap_err().kind(), std::io::ErrorKind::NotFound);
+        assert!(lines.check().unwrap_err().to_string().contains("No such file"));
     }
 
     #[test]
     fn skipped_scenes_are_reported_once_across_resumptions() {
         let folder = tempfile::tempdir().unwrap();
-        let skip = |key: &str, reason: &str| SkippedScene { key: key.into(), reason: reason.into() };
-        let mut count = Count::default();
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, [0; 2], &mut count).unwrap();
-        log.skip(Stage::Stage1, 1, &skip("a", "torn"));
-        log.skip(Stage::Stage1, 2, &skip("a", "torn at another frame"));
-        log.skip(Stage::Stage1, 3, &skip("b", "torn"));
-        log.check().unwrap();
-        assert_eq!(count.0, 2);
+        let skip = |log: &mut RunLog, step, key: &str| {
+            log.skip(ONE, step, &SkippedScene { key: key.into(), reason: "torn".into() });
+        };
+        let write = |from, lines: &[(u64, &str)]| {
+            log(folder.path(), (ONE, [from; 2]), |log| lines.iter().for_each(|(step, key)| skip(log, *step, key)))
+        };
+        assert_eq!(write(0, &[(1, "a"), (2, "a"), (3, "b")]), 2);
         // Resumed after step 2: the line of step 3 is dropped and written again.
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, [2; 2], &mut count).unwrap();
-        log.skip(Stage::Stage1, 3, &skip("b", "torn"));
-        log.skip(Stage::Stage1, 4, &skip("a", "torn"));
-        log.check().unwrap();
-        assert_eq!(count.0, 3);
+        assert_eq!(write(2, &[(3, "b"), (4, "a")]), 1);
         assert_eq!(
             std::fs::read_to_string(folder.path().join("skipped.jsonl")).unwrap(),
             "{\"step\":1,\"stage\":\"stage1\",\"key\":\"a\",\"reason\":\"torn\"}\n\

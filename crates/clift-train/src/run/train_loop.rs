@@ -1,11 +1,16 @@
 //! Training of a stage, new or resumed: step, save, validate, until the last step, an interrupt or an error.
 
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use burn::module::Module;
+use burn::module::{Module, ParamGroup};
+use burn::optim::lr_scheduler::DynLrScheduler;
+use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
+use burn::tensor::Device;
 use clift_core::make_folder;
-use clift_data::plural;
+use clift_data::{Prefetcher, plural};
 use clift_eval::peak_bytes;
 use clift_model::{Network, psnr_of_mse, weights_hash};
 
@@ -16,10 +21,8 @@ use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
-use crate::run::first_steps::{BatchWait, Pace};
 use crate::run::logs::RunLog;
 use crate::run::run_file::require_run;
-use crate::run::stage_plan::StagePlan;
 use crate::run::validation::Validation;
 use crate::stage::settings::{StageSettings, freeze};
 use crate::step::batch::StageBatch;
@@ -28,6 +31,41 @@ use crate::step::loss_scale::LossScale;
 use crate::step::schedule::learning_rate;
 use crate::step::step_guard::{BatchScenes, LossHistory, SkippedStep, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
+
+/// Makes the batch of a step; called from several threads.
+pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;
+
+pub struct StagePlan<'a> {
+    pub settings: StageSettings<'a>,
+    pub batches: Arc<MakeBatch>,
+    pub config: &'a Config,
+    pub folder: PathBuf,
+    pub device: Device,
+    pub ranks: &'a Ranks,
+    pub parts: BatchParts,
+}
+
+/// Steps of a new stage after which its pace is reported.
+const PACE_STEPS: u64 = 20;
+
+/// Most threads that prepare batches where the config sets no number.
+const MAX_THREADS: usize = 16;
+
+impl StagePlan<'_> {
+    fn prefetch(&self, step: u64) -> Prefetcher<StageBatch, TrainError> {
+        let (data, make) = (&self.config.data, self.batches.clone());
+        // A CPU trains on all threads.
+        let unset = if self.config.device.is_cpu() { 1 } else { rayon::current_num_threads().min(MAX_THREADS) };
+        let threads = data.num_threads.unwrap_or(unset);
+        Prefetcher::new(move |step| make(step), step, self.settings.steps, threads, data.num_prefetch.max(threads))
+    }
+
+    /// Returns the learning rates of a step: `lr`, and for the renderer `lr` times its factor.
+    fn learning_rate(&self, lr: f64) -> ModuleLearningRate {
+        let renderer = DynLrScheduler::from(lr * self.settings.renderer_lr_factor);
+        ModuleLrScheduler::new(lr).with_group(ParamGroup::from_predicate("renderer"), renderer).step()
+    }
+}
 
 /// Trains the remaining steps of a stage and returns the model. `start` makes the initial model if there is no checkpoint.
 pub(crate) fn train_stage(
@@ -40,8 +78,11 @@ pub(crate) fn train_stage(
     let started = Instant::now();
     let StagePlan { settings, config, folder, device, ranks, .. } = plan;
     let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
-    let checkpoints = Checkpoints::new(folder.join("checkpoints"), config.checkpoint.clone());
-    let checkpoints = checkpoints.with_model(config.model.clone());
+    let checkpoints = Checkpoints {
+        folder: folder.join("checkpoints"),
+        retention: config.checkpoint.clone(),
+        model: Some(config.model.clone()),
+    };
     let newest = ranks.from_root(|| {
         require_run(&config.run_dir)?;
         checkpoints.newest_step()
@@ -52,22 +93,25 @@ pub(crate) fn train_stage(
         None => start(sink)?,
     };
     let loss = Loss::load(&config.loss, device)?;
-    for term in loss.describe() {
+    if let Some(term) = loss.describe() {
         sink.event(&Event::Message(term));
     }
     let mut train_state = TrainState {
         loss,
-        activation_checkpointing: config.activation_checkpointing,
         precision: config.precision,
         loss_scale: LossScale::of(config.precision),
         ..TrainState::new(model, optimizer, device.clone())
     };
     let progress = match newest {
-        Some(_) if ranks.is_root() => checkpoints.resume(&mut train_state)?,
-        Some(step) => Some(checkpoints.load(step, &mut train_state)?),
-        None => None,
+        Some(step) => {
+            if ranks.is_root() {
+                // Each save removes unfinished saves, but a finished stage makes no further save.
+                checkpoints.remove_unfinished()?;
+            }
+            checkpoints.load(step, &mut train_state)?
+        }
+        None => TrainingPosition::default(),
     };
-    let progress = progress.unwrap_or_default();
     train_state.model = freeze(stage, train_state.model);
     let mut log = if ranks.is_root() {
         make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
@@ -76,18 +120,20 @@ pub(crate) fn train_stage(
         RunLog::silent(sink)
     };
     require_same_weights(&train_state, ranks)?;
-    for line in parts_notes(plan.parts, ranks) {
-        log.event(&Event::Message(line));
+    if ranks.num_ranks() > 1 {
+        let (num_ranks, num_parts) = (ranks.num_ranks(), plan.parts.num_parts());
+        let scenes = plural(plan.parts.batch_size(), "scene");
+        log.event(&Event::Message(format!("{num_ranks} ranks share batches of {scenes} in {num_parts} parts")));
     }
     log.event(&Event::StepStarted { run_step: stage.into(), done: progress.step, num_steps });
 
-    let mut training = TrainLoop::new(plan, checkpoints, progress, validation, stop, log);
+    let saved = progress.step;
+    let mut training = TrainLoop { plan, checkpoints, progress, saved, validation, stop, log };
     let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
     training.log.event(&Event::StepFinished { run_step: stage.into(), elapsed_s: started.elapsed().as_secs_f64() });
     Ok(model)
 }
 
-/// A stage during training.
 struct TrainLoop<'a> {
     plan: &'a StagePlan<'a>,
     checkpoints: Checkpoints,
@@ -96,40 +142,16 @@ struct TrainLoop<'a> {
     saved: u64,
     validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
-    batch_wait: BatchWait,
-    /// Pace of a stage that began in this process.
-    pace: Option<Pace>,
-    /// Last step with images of the present size; 0 before the first step of this process.
-    last_step_of_size: u64,
     log: RunLog<'a>,
 }
 
-impl<'a> TrainLoop<'a> {
-    /// Resumes at `progress`, that of the newest checkpoint.
-    fn new(
-        plan: &'a StagePlan,
-        checkpoints: Checkpoints,
-        progress: TrainingPosition,
-        validation: &'a Validation,
-        stop: &'a AtomicBool,
-        log: RunLog<'a>,
-    ) -> Self {
-        let (saved, batch_wait) = (progress.step, BatchWait::new());
-        let pace = (progress.step == 0).then(Pace::default);
-        Self { plan, checkpoints, saved, progress, validation, stop, batch_wait, pace, last_step_of_size: 0, log }
-    }
-
+impl TrainLoop<'_> {
     fn run(&mut self, mut train_state: TrainState) -> Result<Network, TrainError> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
-        let mut batches = self.plan.prefetch(self.progress.step);
-        loop {
-            self.begin_size();
-            let asked = Instant::now();
-            let Some(batch) = batches.next() else { break };
-            if let Some(hint) = self.batch_wait.add(asked.elapsed(), &self.plan.config.data) {
-                self.log.event(&Event::Message(hint));
-            }
+        // The first step of a new stage is not measured: it may compile kernels.
+        let (is_new, mut measured) = (self.progress.step == 0, None::<Instant>);
+        for batch in self.plan.prefetch(self.progress.step) {
             // Also an error of another rank.
             let batch = batch.and_then(|batch| {
                 let scenes = BatchScenes::gather(&batch, self.plan.parts, self.plan.ranks)?;
@@ -140,7 +162,11 @@ impl<'a> TrainLoop<'a> {
                 Err(error) => return Err(self.save_before(error, &train_state)),
             };
             train_state = self.step(train_state, &batch, &scenes)?;
-            self.report_pace(asked.elapsed().as_secs_f64());
+            let (stage, step) = (self.plan.settings.stage, self.progress.step);
+            let seconds = measured.get_or_insert_with(Instant::now).elapsed().as_secs_f64();
+            if is_new && step == PACE_STEPS {
+                self.log.event(&Event::Pace { stage, step, step_s: seconds / (PACE_STEPS - 1) as f64 });
+            }
             let is_stopped = self.plan.ranks.any(self.stop.load(Ordering::Relaxed))?;
             if is_stopped || self.is_checkpoint_due() {
                 self.save(&train_state)?;
@@ -156,7 +182,6 @@ impl<'a> TrainLoop<'a> {
         Ok(train_state.model)
     }
 
-    /// Makes or skips the next step.
     fn step(
         &mut self,
         train_state: TrainState,
@@ -164,12 +189,17 @@ impl<'a> TrainLoop<'a> {
         scenes: &BatchScenes,
     ) -> Result<TrainState, TrainError> {
         let started = Instant::now();
-        for skip in &scenes.skipped {
-            self.log.skip(self.plan.settings.stage, self.progress.step + 1, skip);
-        }
-        let StageSettings { steps: num_steps, optimizer, .. } = self.plan.settings;
+        let StageSettings { stage, steps: last_step, half_resolution_steps, batch_size, optimizer, .. } =
+            self.plan.settings;
         let step = self.progress.step + 1;
-        let lr = learning_rate(optimizer, step, num_steps);
+        for skip in &scenes.skipped {
+            self.log.skip(stage, step, skip);
+        }
+        let lr = learning_rate(optimizer, step, last_step);
+        if step == half_resolution_steps + 1 {
+            // Loss and gradient norm of smaller images say nothing about the following steps.
+            self.progress.recent = LossHistory::default();
+        }
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
         let mut anomaly = None;
         // Checked before the update: a skipped step does not change the weights.
@@ -180,7 +210,20 @@ impl<'a> TrainLoop<'a> {
         let ranks = (self.plan.parts, self.plan.ranks);
         let (mut train_state, update) = train_state.step_if(batch, ranks, rate, optimizer.max_grad_norm, accept)?;
         self.progress.step = step;
-        self.report(update, lr, started);
+        let step_s = started.elapsed().as_secs_f64();
+        let num_images = batch_size * self.plan.config.data.views.num_targets;
+        self.log.event(&Event::Step(StepEvent {
+            stage,
+            step,
+            last_step,
+            loss: update.loss,
+            psnr: psnr_of_mse(update.mse),
+            lr,
+            grad_norm: update.grad_norm,
+            step_s,
+            images_per_s: num_images as f64 / step_s.max(1e-9),
+            peak_bytes: peak_bytes(),
+        }));
         if train_state.adapt_loss_scale(&update) {
             // An overflow is not an anomaly of the batch.
             let factor = train_state.loss_scale.map_or(1.0, |scale| scale.factor());
@@ -196,55 +239,6 @@ impl<'a> TrainLoop<'a> {
             Some(anomaly) => self.skip_step(anomaly, update, scenes)?,
         }
         Ok(train_state)
-    }
-
-    /// Reports the size of the images before the first step of this process and where it changes. Where it changes, loss,
-    /// gradient norm and reading time of the former size say nothing about the following steps.
-    fn begin_size(&mut self) {
-        let step = self.progress.step + 1;
-        let settings = &self.plan.settings;
-        let StageSettings { stage, steps: last_step, half_resolution_steps, .. } = *settings;
-        let last_step_of_size = settings.last_step_of_size(step);
-        if half_resolution_steps == 0 || step > last_step || self.last_step_of_size == last_step_of_size {
-            return;
-        }
-        self.last_step_of_size = last_step_of_size;
-        if step == half_resolution_steps + 1 {
-            self.progress.recent = LossHistory::default();
-            self.batch_wait = BatchWait::new();
-        }
-        let Config { data, .. } = self.plan.config;
-        let divisor = if settings.is_half_resolution(step) { 2 } else { 1 };
-        let size = [data.width, data.height].map(|side| side / divisor);
-        self.log.event(&Event::ImageSize { stage, size, done: step - 1, last_step_of_size, last_step });
-    }
-
-    fn report(&mut self, update: Update, lr: f64, started: Instant) {
-        let step_s = started.elapsed().as_secs_f64();
-        let num_images = self.plan.settings.batch_size * self.plan.config.data.views.num_targets;
-        self.log.event(&Event::Step(StepEvent {
-            stage: self.plan.settings.stage,
-            step: self.progress.step,
-            last_step: self.plan.settings.steps,
-            last_step_of_size: self.plan.settings.last_step_of_size(self.progress.step),
-            loss: update.loss,
-            psnr: psnr_of_mse(update.mse),
-            lr,
-            grad_norm: update.grad_norm,
-            step_s,
-            images_per_s: num_images as f64 / step_s.max(1e-9),
-            peak_bytes: peak_bytes(),
-        }));
-    }
-
-    /// Reports the pace after the first steps of a stage that began in this process.
-    fn report_pace(&mut self, step_s: f64) {
-        let Some(step_s) = self.pace.as_mut().and_then(|pace| pace.add(step_s)) else { return };
-        let StageSettings { stage, steps: last_step, .. } = self.plan.settings;
-        let step = self.progress.step;
-        let last_step_of_size = self.plan.settings.last_step_of_size(step);
-        let peak_bytes = peak_bytes();
-        self.log.event(&Event::Pace { stage, step, last_step_of_size, last_step, step_s, peak_bytes });
     }
 
     /// Counts and logs a step without update; [`TrainError::Diverged`] after `max_bad_steps` consecutive ones.
@@ -313,12 +307,13 @@ impl<'a> TrainLoop<'a> {
         if !is_due || validated == step {
             return Ok(());
         }
-        let (stage, samples, ranks) = (self.plan.settings.stage, self.plan.folder.join("samples"), self.plan.ranks);
-        if ranks.is_root() {
+        let ranks = self.plan.ranks;
+        let psnr = ranks.from_root(|| {
             require_run(&self.plan.config.run_dir)?;
-        }
-        let model = train_state.model.valid();
-        let psnr = self.validation.validate(&model, stage, step, (&samples, ranks), self.stop, &mut self.log)?;
+            let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
+            let model = train_state.model.valid();
+            self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)
+        })?;
         if psnr.is_none() && ranks.any(self.stop.load(Ordering::Relaxed))? {
             if self.saved < step {
                 self.save(train_state)?;
@@ -366,28 +361,11 @@ impl<'a> TrainLoop<'a> {
     }
 }
 
-/// Checks that the weights are the same on every rank.
 fn require_same_weights(train_state: &TrainState, ranks: &Ranks) -> Result<(), TrainError> {
     if ranks.num_ranks() == 1 {
         return Ok(());
     }
     ranks.require_same("the weights", &weights_hash(&train_state.model))
-}
-
-/// Describes how several ranks share a batch.
-fn parts_notes(parts: BatchParts, ranks: &Ranks) -> Vec<String> {
-    let (num_ranks, num_parts, num_scenes) = (ranks.num_ranks(), parts.num_parts(), parts.batch_size());
-    if num_ranks == 1 {
-        return Vec::new();
-    }
-    let mut notes =
-        vec![format!("{num_ranks} ranks share batches of {} in {num_parts} parts", plural(num_scenes, "scene"))];
-    if !num_parts.is_multiple_of(num_ranks) {
-        notes.push(format!(
-            "{num_parts} parts leave ranks idle; a multiple of {num_ranks} in accumulate keeps them busy"
-        ));
-    }
-    notes
 }
 
 fn is_multiple(step: u64, every: u64) -> bool {

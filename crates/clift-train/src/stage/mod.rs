@@ -1,11 +1,9 @@
 //! Stage-specific settings and batches.
 //!
-//! - `interpolation`: weights between those before and after stage 2
 //! - `settings`: steps, batch, optimizer per stage
 //! - `stage1_batches`: random token subsets
 //! - `stage2_batches`: cached clusters
 
-pub(crate) mod interpolation;
 pub(crate) mod settings;
 pub(crate) mod stage1_batches;
 pub(crate) mod stage2_batches;

@@ -36,28 +36,14 @@ impl Stage {
 }
 
 /// Freezes the networks that the stage does not train: their parameters get no gradient and no weight decay.
-pub fn freeze(stage: Stage, mut model: Network) -> Network {
-    let trained = stage.trained();
-    if !trained.contains(&Part::Encoder) {
-        model.encoder = model.encoder.no_grad();
+pub fn freeze(stage: Stage, model: Network) -> Network {
+    match stage {
+        Stage::Stage1 => Network { condenser: model.condenser.no_grad(), ..model },
+        Stage::Stage2 => Network { encoder: model.encoder.no_grad(), ..model },
     }
-    if !trained.contains(&Part::Condenser) {
-        model.condenser = model.condenser.no_grad();
-    }
-    model
 }
 
 impl StageSettings<'_> {
-    /// Returns whether the images of `step`, counted from 1, have half the width and height.
-    pub fn is_half_resolution(&self, step: u64) -> bool {
-        step <= self.half_resolution_steps
-    }
-
-    /// Returns the last step with the image size of `step`, counted from 1.
-    pub fn last_step_of_size(&self, step: u64) -> u64 {
-        if self.is_half_resolution(step) { self.half_resolution_steps } else { self.steps }
-    }
-
     /// Returns the most scenes of a micro-batch.
     pub fn micro_batch_size(&self) -> usize {
         self.batch_size.div_ceil(self.accumulate)
@@ -71,11 +57,6 @@ impl Stage1Config {
     /// Returns how many of `steps` steps of stage 1 have images of half the width and height: the share, rounded down.
     pub(crate) fn half_resolution_steps(&self, steps: u64) -> u64 {
         (self.half_resolution * steps as f64 + ROUNDING) as u64
-    }
-
-    /// Returns the largest number of steps of which at most `count` have images of half the width and height.
-    pub(crate) fn most_steps(&self, count: u64) -> u64 {
-        ((count as f64 + 1.0 - ROUNDING) / self.half_resolution).ceil() as u64 - 1
     }
 }
 

@@ -13,18 +13,11 @@ use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Maker of the batches of stage 1, a pure function of (seed, step).
 pub struct Stage1Batches {
-    /// Clips of every image size.
-    sizes: Vec<SizedClips>,
+    /// Clips of every image size, and those of the steps with half the resolution, where there are such steps.
+    sizes: Vec<(TrainingClips, Option<TrainingClips>)>,
     config: Config,
     parts: BatchParts,
     seed: u64,
-}
-
-/// Clips of one image size.
-struct SizedClips {
-    whole: TrainingClips,
-    /// Clips of the steps with half the resolution, where there are such steps.
-    half: Option<TrainingClips>,
 }
 
 impl Stage1Batches {
@@ -32,14 +25,11 @@ impl Stage1Batches {
     pub fn new(config: &Config, reader: &ClipReader, parts: BatchParts) -> Result<Self, TrainError> {
         let Config { data, stage1, .. } = config;
         let seed = derive_seed(config.seed, "stage1");
-        let clips = |reader: ClipReader| {
-            let clips = TrainingClips::new(reader, data.views.clone(), stage1.batch_size, seed);
-            clips.map(|clips| clips.with_flip(data.flip))
-        };
+        let clips = |reader: ClipReader| TrainingClips::new(reader, data.views.clone(), stage1.batch_size, seed);
         let has_half = config.stage(Stage::Stage1).half_resolution_steps > 0;
         let sized = |(data, reader): (DataConfig, ClipReader)| {
             let half = has_half.then(|| clips(half_size_reader(&data, &reader)?)).transpose()?;
-            Ok(SizedClips { whole: clips(reader)?, half })
+            Ok((clips(reader)?, half))
         };
         let further = stage1.further_sizes.iter().map(|&size| resized_reader(data, reader, size));
         let readers = std::iter::once(Ok((data.clone(), reader.clone()))).chain(further);
@@ -52,9 +42,9 @@ impl Stage1Batches {
     /// Image size and share of tokens are sampled once per step; every target view gets its own random subset.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let (mut clips, mut skipped) = (Vec::new(), Vec::new());
-        let is_half = self.config.stage(Stage::Stage1).is_half_resolution(step + 1);
-        let sized = &self.sizes[uniform_below(&mut step_rng(self.seed, step, "image size"), self.sizes.len())];
-        let source = sized.half.as_ref().filter(|_| is_half).unwrap_or(&sized.whole);
+        let is_half = step < self.config.stage(Stage::Stage1).half_resolution_steps;
+        let (whole, half) = &self.sizes[uniform_below(&mut step_rng(self.seed, step, "image size"), self.sizes.len())];
+        let source = half.as_ref().filter(|_| is_half).unwrap_or(whole);
         for slot in self.parts.slots() {
             let mut of_slot = Vec::new();
             clips.push(source.slot(step, slot, &mut of_slot)?);

@@ -1,10 +1,9 @@
 //! Batches of stage 2: clips with cached clusters.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use clift_core::{derive_seed, item_rng, step_rng, uniform_below};
-use clift_data::{Clip, ClipReader, NoUsableScene, SkippedScene, SlotFiller, ViewIndices, ViewSampler};
+use clift_data::{Clip, ClipReader, SkippedScene, ViewIndices, ViewSampler};
 use clift_model::SceneClusters;
 
 use crate::cluster_cache::cache::{CacheEntry, ClusterCache};
@@ -14,12 +13,12 @@ use crate::error::TrainError;
 use crate::step::batch::{BatchTokens, StageBatch};
 
 /// Attempts per slot, repeated entries included, before the batch fails.
-const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
+const MAX_ATTEMPTS: u32 = 16;
 
 /// Maker of the batches of stage 2, a pure function of (seed, step) and the cluster cache.
 pub struct Stage2Batches {
     reader: ClipReader,
-    cache: Arc<ClusterCache>,
+    cache: ClusterCache,
     /// Entries with equal numbers of tokens and of clusters, which a batch needs.
     groups: Vec<Vec<usize>>,
     parts: BatchParts,
@@ -32,7 +31,7 @@ impl Stage2Batches {
     pub fn new(
         config: &Config,
         reader: &ClipReader,
-        cache: Arc<ClusterCache>,
+        cache: ClusterCache,
         parts: BatchParts,
     ) -> Result<Self, TrainError> {
         let mut groups: BTreeMap<_, Vec<usize>> = BTreeMap::new();
@@ -54,7 +53,7 @@ impl Stage2Batches {
 
     /// Makes the batch of `step`, counted from 0: samples a group, then its entries.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
-        let group = &self.groups[self.sample_group(step)];
+        let group = self.sample_group(step);
         let (mut clips, mut clusters, mut skipped) = (Vec::new(), Vec::new(), Vec::new());
         for slot in self.parts.slots() {
             let mut of_slot = Vec::new();
@@ -67,16 +66,15 @@ impl Stage2Batches {
     }
 
     /// Samples a group in proportion to its size, so that all entries are equally likely.
-    fn sample_group(&self, step: u64) -> usize {
+    fn sample_group(&self, step: u64) -> &[usize] {
         let total = self.groups.iter().map(Vec::len).sum();
-        let mut index = uniform_below(&mut step_rng(self.seed, step, "token count"), total);
-        for (i, group) in self.groups.iter().enumerate() {
-            if index < group.len() {
-                return i;
-            }
-            index -= group.len();
-        }
-        0
+        let index = uniform_below(&mut step_rng(self.seed, step, "token count"), total);
+        let ends = self.groups.iter().scan(0, |end, group| {
+            *end += group.len();
+            Some(*end)
+        });
+        let found = self.groups.iter().zip(ends).find(|(_, end)| index < *end);
+        found.map(|(group, _)| group.as_slice()).unwrap_or_default()
     }
 
     fn fill_slot(
@@ -86,20 +84,17 @@ impl Stage2Batches {
         group: &[usize],
         skipped: &mut Vec<SkippedScene>,
     ) -> Result<(Clip, SceneClusters), TrainError> {
-        // The entry is the first value of the stream of an attempt, the targets are the following ones.
-        let sample = |attempt| {
+        for attempt in 0..MAX_ATTEMPTS {
+            // The entry is the first value of the stream of an attempt, the targets are the following ones.
             let mut rng = item_rng(self.seed, step, slot as u32, attempt, "entry and targets");
-            (group[uniform_below(&mut rng, group.len())], rng)
-        };
-        let read = |entry: usize, attempt| {
-            let entry = &self.cache.entries()[entry];
-            let skip = |error: TrainError| SkippedScene { key: entry.key.clone(), reason: error.to_string() };
-            self.read(entry, &mut sample(attempt).1).map_err(skip)
-        };
-        FILLER.fill(|attempt| sample(attempt).0, read, skipped).map_err(|NoUsableScene { attempts, last }| {
-            let SkippedScene { key, reason } = last;
-            TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {attempts} tries; {key}: {reason}") }
-        })
+            let entry = &self.cache.entries()[group[uniform_below(&mut rng, group.len())]];
+            match self.read(entry, &mut rng) {
+                Ok(item) => return Ok(item),
+                Err(error) => skipped.push(SkippedScene { key: entry.key.clone(), reason: error.to_string() }),
+            }
+        }
+        let last = skipped.last().map(|SkippedScene { key, reason }| format!("{key}: {reason}")).unwrap_or_default();
+        Err(TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {MAX_ATTEMPTS} tries; {last}") })
     }
 
     fn read(&self, entry: &CacheEntry, rng: &mut impl rand::Rng) -> Result<(Clip, SceneClusters), TrainError> {

@@ -21,7 +21,6 @@ pub struct StageBatch {
     pub skipped: Vec<(usize, SkippedScene)>,
 }
 
-/// A part of a batch.
 pub(crate) struct MicroBatch<'a> {
     pub clips: &'a [Clip],
     pub tokens: BatchTokens,
@@ -61,16 +60,14 @@ impl StageBatch {
 
 impl BatchTokens {
     /// Selects the tokens of the renderer from the encoder's tokens.
-    pub(crate) fn step(&self) -> impl Fn(&Network, Tokens) -> Result<RenderTokens, TrainError> {
-        move |model: &Network, lift: Tokens| {
-            Ok(match self {
-                Self::All => lift.into(),
-                Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
-                Self::Clusters(clusters) => {
-                    let index = Clusters::new(clusters.clone())?.upload(&lift.values.device());
-                    model.compress(lift, &index).into()
-                }
-            })
-        }
+    pub(crate) fn select(&self, model: &Network, lift: Tokens) -> Result<RenderTokens, TrainError> {
+        Ok(match self {
+            Self::All => lift.into(),
+            Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+            Self::Clusters(clusters) => {
+                let index = Clusters::new(clusters.clone())?.upload(&lift.values.device());
+                model.compress(lift, &index).into()
+            }
+        })
     }
 }

@@ -4,7 +4,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::ClipViews;
 use clift_data::Clip;
-use clift_model::{Cameras, Network, Pass, TokenStep, Views, upload_images};
+use clift_model::{Cameras, Network, Views, upload_images};
 
 use crate::error::TrainError;
 use crate::step::batch::BatchTokens;
@@ -56,39 +56,15 @@ impl DeviceBatch {
             target_weights: TargetWeights::upload(clips, device),
         })
     }
-}
-
-impl DeviceBatch {
-    /// Returns the same views without autodiff.
-    pub(crate) fn untracked(&self) -> Self {
-        let cameras = |cameras: &Cameras| Cameras {
-            c2w: cameras.c2w.clone().inner(),
-            intrinsics: cameras.intrinsics.clone().inner(),
-            ..*cameras
-        };
-        let context = Views { images: self.context.images.clone().inner(), cameras: cameras(&self.context.cameras) };
-        let (targets, target_images) = (cameras(&self.targets), self.target_images.clone().inner());
-        let untracked = |weights: &TargetWeights| TargetWeights { values: weights.values.clone().inner(), ..*weights };
-        Self { context, targets, target_images, target_weights: self.target_weights.as_ref().map(untracked) }
-    }
 
     /// Returns the loss of a rendering. Masked pixels are replaced by the target's, so that they add nothing, and the loss
     /// is divided by the share of the others.
-    pub(crate) fn loss(&self, loss: &Loss, rendering: Rendering) -> LossParts {
+    fn loss(&self, loss: &Loss, rendering: Rendering) -> LossParts {
         let target = self.target_images.clone();
         let Some(TargetWeights { values, mean }) = &self.target_weights else { return loss.of(&rendering, target) };
         let images = target.clone() + (rendering.images - target.clone()) * values.clone();
         let LossParts { total, mse } = loss.of(&Rendering { images, ..rendering }, target);
         LossParts { total: total.div_scalar(*mean), mse: mse.div_scalar(*mean) }
-    }
-
-    /// Describes the forward pass of a model from the context views to images of the target views.
-    pub(crate) fn pass<'a>(
-        &'a self,
-        model: &'a Network,
-        token_step: TokenStep<'a, TrainError>,
-    ) -> Pass<'a, TrainError> {
-        Pass::new(model, &self.context, &self.targets, token_step)
     }
 }
 
@@ -100,9 +76,10 @@ pub fn render_loss(
     loss: &Loss,
     step: u64,
 ) -> Result<LossParts, TrainError> {
-    let token_step = batch_tokens.step();
-    let pass = device_batch.pass(model, &token_step);
-    Ok(device_batch.loss(loss, Rendering::of(&pass, pass.forward()?, step)))
+    let tokens = batch_tokens.select(model, model.encode(&device_batch.context))?;
+    let values = tokens.values().clone();
+    let images = model.renderer.forward(tokens, &device_batch.targets);
+    Ok(device_batch.loss(loss, Rendering { images, tokens: values, step }))
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! The sum of the gradients of all parts of a batch, on several ranks.
 //!
-//! Every rank adds up a range of every block of values, in the order of the parts, and sends its sums to the others: as
+//! Every rank adds up a range of the values, in the order of the parts, and sends its sums to the others: as
 //! many bytes as a ring, and on any number of ranks the sum of one process, bit for bit. Values are in the order of the
 //! module.
 
@@ -11,15 +11,9 @@ use burn::tensor::{Device, Tensor, TensorData};
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
 
-/// Most values that are copied from the device at once, unless one parameter has more.
-const MAX_COPIED: usize = 1 << 24;
-
-/// A sum during the rounds of an update.
 #[derive(Debug, Default)]
 pub(crate) struct GradientSum {
-    /// Whether each parameter has a gradient.
     has_gradient: Vec<bool>,
-    /// Number of values of all gradients.
     len: usize,
     /// The ranges that this rank adds up.
     own: Vec<f32>,
@@ -27,9 +21,6 @@ pub(crate) struct GradientSum {
 
 impl GradientSum {
     /// Adds the gradients of a round, which the first `num_working` ranks have, and the others not.
-    ///
-    /// # Errors
-    /// [`TrainError::Device`] and [`TrainError::RanksDiffer`], and those of [`Ranks::gather`].
     pub fn add<M: Module>(
         &mut self,
         module: &M,
@@ -37,14 +28,11 @@ impl GradientSum {
         num_working: usize,
         ranks: &Ranks,
     ) -> Result<(), TrainError> {
-        let mut flatten =
-            Flatten { grads, has_gradient: Vec::new(), pending: Vec::new(), values: Vec::new(), failure: None };
+        let mut flatten = Flatten { grads, has_gradient: Vec::new(), flat: Vec::new() };
         module.visit(&mut flatten);
-        flatten.copy();
-        let Flatten { has_gradient, values, failure, .. } = flatten;
-        if let Some(reason) = failure {
-            return Err(TrainError::Device { reason });
-        }
+        let Flatten { has_gradient, flat, .. } = flatten;
+        let values = if flat.is_empty() { Ok(Vec::new()) } else { Tensor::cat(flat, 0).try_into_vec_as::<f32>() };
+        let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
         let all = ranks.gather((has_gradient, values.len()))?;
         if let Some(rank) = (0..num_working).find(|&rank| all[rank] != all[0]) {
             return Err(TrainError::RanksDiffer { what: "the trained parameters", rank });
@@ -69,44 +57,21 @@ impl GradientSum {
     }
 }
 
-/// Copies gradients to the host, one after the other.
+/// Collects gradients in the order of the module.
 struct Flatten {
     grads: GradientsParams,
     has_gradient: Vec<bool>,
-    /// Gradients on the device.
-    pending: Vec<Tensor<1>>,
-    values: Vec<f32>,
-    failure: Option<String>,
+    flat: Vec<Tensor<1>>,
 }
 
 impl ModuleVisitor for Flatten {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         let grad = self.grads.remove::<D>(param.id);
         self.has_gradient.push(grad.is_some());
-        if let Some(grad) = grad {
-            let count = grad.shape().num_elements();
-            if self.pending.iter().map(|grad| grad.dims()[0]).sum::<usize>() + count > MAX_COPIED {
-                self.copy();
-            }
-            self.pending.push(grad.reshape([count]));
-        }
+        self.flat.extend(grad.map(|grad| grad.flatten(0, D - 1)));
     }
 }
 
-impl Flatten {
-    fn copy(&mut self) {
-        let pending = std::mem::take(&mut self.pending);
-        if pending.is_empty() {
-            return;
-        }
-        match Tensor::cat(pending, 0).try_into_vec_as::<f32>() {
-            Ok(values) => self.values.extend(values),
-            Err(error) => self.failure = Some(error.to_string()),
-        }
-    }
-}
-
-/// Makes gradients of values, the other way round.
 struct Restore<'a> {
     has_gradient: std::vec::IntoIter<bool>,
     values: &'a [f32],

@@ -1,15 +1,14 @@
-//! The training loss (paper section 3.3): mean squared error and weighted terms.
+//! The training loss (paper section 3.3): mean squared error and a perceptual term.
 
-use std::fmt;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
-use clift_model::{Pass, PassState, Perceptual};
+use clift_model::Perceptual;
 
 use crate::config::config::LossConfig;
 use crate::error::TrainError;
 
-/// Rendered target views of a batch, and their origin.
+/// Rendered target views of a batch, and their origin: what a term of the loss may depend on.
 #[derive(Clone, Debug)]
 pub struct Rendering {
     /// RGB in `(0, 1)`, `[batch, views, height, width, 3]`.
@@ -20,42 +19,10 @@ pub struct Rendering {
     pub step: u64,
 }
 
-impl Rendering {
-    /// Decodes the values after the last block of a pass.
-    pub(crate) fn of<E>(pass: &Pass<'_, E>, last: PassState, step: u64) -> Self {
-        let tokens = last.tokens.as_ref().expect("the renderer's tokens").values().clone();
-        Self { images: pass.to_image(last), tokens, step }
-    }
-}
-
-/// A term of the training loss. `examples/custom_loss.rs` trains with a new one.
-pub trait LossTerm: fmt::Debug + Send + Sync {
-    /// Computes the term, `[1]`, with autodiff.
-    ///
-    /// # Shapes
-    /// - `target`: `[batch, views, height, width, 3]` in `[0, 1]`
-    fn loss(&self, rendering: &Rendering, target: &Tensor<5>) -> Tensor<1>;
-
-    /// Describes the term for the log of a run.
-    fn describe(&self) -> Option<String> {
-        None
-    }
-}
-
-impl LossTerm for Perceptual {
-    fn loss(&self, rendering: &Rendering, target: &Tensor<5>) -> Tensor<1> {
-        self.forward(rendering.images.clone(), target.clone())
-    }
-
-    fn describe(&self) -> Option<String> {
-        Some(format!("perceptual loss: weights with SHA-256 {}", self.sha256()))
-    }
-}
-
-/// The minimized loss, the same in both stages: mean squared error plus weighted terms. The default has no further term.
+/// The minimized loss, the same in both stages: mean squared error, and a weighted perceptual term if the config has one.
 #[derive(Clone, Debug, Default)]
 pub struct Loss {
-    terms: Vec<(f64, Arc<dyn LossTerm>)>,
+    perceptual: Option<(f64, Arc<Perceptual>)>,
 }
 
 /// The loss of a batch, with autodiff.
@@ -72,19 +39,13 @@ impl Loss {
     pub fn load(config: &LossConfig, device: &Device) -> Result<Self, TrainError> {
         let Some(path) = config.weights()? else { return Ok(Self::default()) };
         let network = Perceptual::load(path, &device.clone().without_autodiff())?;
-        Ok(Self::default().with_term(config.perceptual_weight, network))
+        Ok(Self { perceptual: Some((config.perceptual_weight, Arc::new(network))) })
     }
 
-    /// Adds `weight` times a term.
-    #[must_use]
-    pub fn with_term(mut self, weight: f64, term: impl LossTerm + 'static) -> Self {
-        self.terms.push((weight, Arc::new(term)));
-        self
-    }
-
-    /// Describes the terms for the log of a run.
-    pub fn describe(&self) -> impl Iterator<Item = String> {
-        self.terms.iter().filter_map(|(_, term)| term.describe())
+    /// Describes the perceptual term for the log of a run.
+    pub fn describe(&self) -> Option<String> {
+        let (_, network) = self.perceptual.as_ref()?;
+        Some(format!("perceptual loss: weights with SHA-256 {}", network.sha256()))
     }
 
     /// Computes the loss of a rendering.
@@ -93,8 +54,13 @@ impl Loss {
     /// - `target`: `[batch, views, height, width, 3]` in `[0, 1]`
     pub fn of(&self, rendering: &Rendering, target: Tensor<5>) -> LossParts {
         let mse = mse(rendering.images.clone(), target.clone());
-        let weighted = self.terms.iter().map(|(weight, term)| term.loss(rendering, &target).mul_scalar(*weight));
-        LossParts { total: weighted.fold(mse.clone(), |total, term| total + term), mse }
+        let total = match &self.perceptual {
+            Some((weight, network)) => {
+                mse.clone() + network.forward(rendering.images.clone(), target).mul_scalar(*weight)
+            }
+            None => mse.clone(),
+        };
+        LossParts { total, mse }
     }
 }
 

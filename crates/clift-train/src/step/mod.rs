@@ -10,11 +10,9 @@
 //! - `optimizer`: `AdamW` or Muon for a stage, gradient norm and clipping
 //! - `schedule`: warm-up and cosine
 //! - `seeded_inputs`: batches and weights from a seed, for tests and benchmarks
-//! - `activation_checkpointing`: backward from stored block inputs
 //! - `train_state`: model, optimizer, one update
 //! - `step_guard`: skip anomalous steps
 
-pub(crate) mod activation_checkpointing;
 pub(crate) mod adamw;
 pub(crate) mod batch;
 pub(crate) mod device_batch;

@@ -50,6 +50,11 @@ fn views(positions: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -
         }
     }
     let num_views = positions.len();
+    // Turned towards the centre of the arc.
+    let pose = |position: f64| Pose {
+        rotation: DMat3::from_rotation_y(-0.5 * position),
+        translation: DVec3::new(position, 0.0, 0.25 * position * position),
+    };
     ClipViews {
         width,
         height,
@@ -57,12 +62,6 @@ fn views(positions: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -
         cameras: positions.into_iter().map(|position| Camera { c2w: pose(position), intrinsics }).collect(),
         frame_index: (0..num_views).collect(),
     }
-}
-
-/// Returns the pose at a position of the arc, turned towards its centre.
-fn pose(position: f64) -> Pose {
-    let rotation = DMat3::from_rotation_y(-0.5 * position);
-    Pose { rotation, translation: DVec3::new(position, 0.0, 0.25 * position * position) }
 }
 
 /// Makes random clusters: every cluster has one token of its own, the other tokens have any cluster.
@@ -136,39 +135,4 @@ pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Network
         }
     }
     Network::new(config, seed, &device.clone().autodiff()).map(&mut OpenGates { seed, path: Vec::new() })
-}
-
-#[cfg(test)]
-mod tests {
-    use burn::module::ModuleVisitor;
-
-    use super::*;
-
-    #[test]
-    fn seeded_clips_are_valid_and_reproducible() {
-        let shape = ClipShape { num_context: 3, num_targets: 2, size: [8, 16] };
-        let clip = seeded_clip(shape, 5, 1);
-        assert_eq!((clip.context.num_views(), clip.target.num_views()), (3, 2));
-        assert_eq!(clip.context.images.len(), 3 * 8 * 16 * 3);
-        assert!(clip.context.cameras.iter().all(|camera| camera.c2w.orthonormality_defect() < 1e-12));
-        assert!(clip.context.cameras.windows(2).all(|pair| pair[0] != pair[1]), "views differ");
-        assert_eq!(clip, seeded_clip(shape, 5, 1));
-        assert_ne!(clip.context.images, seeded_clip(shape, 6, 1).context.images);
-    }
-
-    #[test]
-    fn no_weight_matrix_is_zero() {
-        struct NotZero(usize);
-        impl ModuleVisitor for NotZero {
-            fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-                assert!(param.val().is_require_grad());
-                assert!(D != 2 || param.val().inner().abs().max().into_scalar::<f32>() > 0.0);
-                self.0 += 1;
-            }
-        }
-        let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
-        let mut visitor = NotZero(0);
-        seeded_model(&config, 0, &Device::flex()).visit(&mut visitor);
-        assert!(visitor.0 > 0);
-    }
 }

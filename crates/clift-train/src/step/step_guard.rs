@@ -101,16 +101,6 @@ pub struct SkippedStepScene {
     pub target: Vec<usize>,
 }
 
-impl SkippedStepScene {
-    fn of(clip: &Clip) -> Self {
-        Self {
-            key: clip.key.clone(),
-            context: clip.context.frame_index.clone(),
-            target: clip.target.frame_index.clone(),
-        }
-    }
-}
-
 /// The scenes of a whole batch for the logs, in the order of slots.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BatchScenes {
@@ -122,7 +112,12 @@ pub struct BatchScenes {
 impl BatchScenes {
     /// Joins the scenes of all ranks. `batch` has those of this rank's slots.
     pub fn gather(batch: &StageBatch, parts: BatchParts, ranks: &Ranks) -> Result<Self, TrainError> {
-        let scenes: Vec<_> = parts.slots().zip(batch.clips.iter().map(SkippedStepScene::of)).collect();
+        let scene = |clip: &Clip| SkippedStepScene {
+            key: clip.key.clone(),
+            context: clip.context.frame_index.clone(),
+            target: clip.target.frame_index.clone(),
+        };
+        let scenes: Vec<_> = parts.slots().zip(batch.clips.iter().map(scene)).collect();
         let (scenes, skipped): (Vec<_>, Vec<_>) = ranks.gather((scenes, batch.skipped.clone()))?.into_iter().unzip();
         Ok(Self { scenes: in_order(scenes), skipped: in_order(skipped) })
     }
@@ -139,43 +134,23 @@ fn in_order<T>(items: Vec<Vec<(usize, T)>>) -> Vec<T> {
 mod tests {
     use super::*;
 
-    fn with_factor(spike_factor: f64) -> OptimizerConfig {
-        OptimizerConfig { spike_factor, ..OptimizerConfig::default() }
-    }
-
-    fn after(steps: impl IntoIterator<Item = (f64, f64)>) -> LossHistory {
+    #[test]
+    fn anomalies_are_values_that_are_not_finite_and_spikes_above_the_median() {
         let mut recent = LossHistory::default();
-        steps.into_iter().for_each(|(loss, norm)| recent.push(loss, norm));
-        recent
-    }
-
-    #[test]
-    fn non_finite_values_are_anomalies_from_the_first_step() {
-        let recent = LossHistory::default();
+        let anomaly = |recent: &LossHistory, loss, norm, spike_factor| {
+            recent.anomaly(loss, norm, &OptimizerConfig { spike_factor, ..OptimizerConfig::default() })
+        };
         for (loss, norm) in [(f64::NAN, 1.0), (1.0, f64::INFINITY), (f64::NEG_INFINITY, f64::NAN)] {
-            assert_eq!(recent.anomaly(loss, norm, &with_factor(0.0)), Some(StepAnomaly::NotFinite));
+            assert_eq!(anomaly(&recent, loss, norm, 0.0), Some(StepAnomaly::NotFinite));
         }
-        assert_eq!(recent.anomaly(1e300, 1e300, &with_factor(2.0)), None, "without history there are no spikes");
-    }
-
-    #[test]
-    fn spikes_exceed_the_factor_times_the_median() {
-        let recent = after((1..=21).map(|i| (f64::from(i), 2.0 * f64::from(i))));
-        let anomaly = |loss, norm, factor| recent.anomaly(loss, norm, &with_factor(factor));
-        assert_eq!(recent.medians(), [Some(11.0), Some(22.0)]);
-        assert_eq!(anomaly(33.0, 66.0, 3.0), None, "exactly the factor");
-        assert_eq!(anomaly(33.1, 66.0, 3.0), Some(StepAnomaly::LossSpike));
-        assert_eq!(anomaly(33.0, 66.1, 3.0), Some(StepAnomaly::GradNormSpike));
-        assert_eq!(anomaly(1e30, 1e30, 0.0), None, "0 looks for none");
-    }
-
-    #[test]
-    fn median_needs_20_steps_of_the_last_101() {
-        assert_eq!(after(vec![(1.0, 1.0); 19]).medians(), [None; 2]);
-        assert_eq!(after(vec![(1.0, 1.0); 20]).medians(), [Some(1.0); 2]);
-        let steps = (0..202).map(|i| if i < 101 { (1.0, 1.0) } else { (7.0, 8.0) });
-        assert_eq!(after(steps).medians(), [Some(7.0), Some(8.0)]);
-        let steps = (1..=102).map(|i| (f64::from(i), 2.0 * f64::from(i)));
-        assert_eq!(after(steps).medians(), [Some(52.0), Some(104.0)], "the first step is forgotten");
+        (1..=19).for_each(|_| recent.push(1.0, 1.0));
+        assert_eq!(recent.medians(), [None; 2]);
+        assert_eq!(anomaly(&recent, 1e300, 1e300, 2.0), None, "without a median there are no spikes");
+        (1..=101).for_each(|i| recent.push(f64::from(i), 2.0 * f64::from(i)));
+        assert_eq!(recent.medians(), [Some(51.0), Some(102.0)], "the earlier steps are forgotten");
+        assert_eq!(anomaly(&recent, 153.0, 306.0, 3.0), None, "exactly the factor");
+        assert_eq!(anomaly(&recent, 153.1, 306.0, 3.0), Some(StepAnomaly::LossSpike));
+        assert_eq!(anomaly(&recent, 153.0, 306.1, 3.0), Some(StepAnomaly::GradNormSpike));
+        assert_eq!(anomaly(&recent, 1e30, 1e30, 0.0), None, "0 looks for none");
     }
 }

@@ -9,7 +9,6 @@ use crate::config::config::OptimizerConfig;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
 use crate::error::TrainError;
-use crate::step::activation_checkpointing;
 use crate::step::batch::{MicroBatch, StageBatch};
 use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::gradient_sum::GradientSum;
@@ -27,8 +26,6 @@ pub struct TrainState {
     pub device: Device,
     /// The minimized loss.
     pub loss: Loss,
-    /// Whether the backward recomputes every block instead of storing its activations.
-    pub activation_checkpointing: bool,
     /// Operands of matrix products.
     pub precision: Precision,
     /// Loss scale of training with f16 products; `None` for others.
@@ -49,18 +46,10 @@ pub struct Update {
 }
 
 impl TrainState {
-    /// Makes the state before the first update: mean squared error, f32, activations stored.
+    /// Makes the state before the first update: mean squared error, f32.
     pub fn new(model: Network, optimizer: &OptimizerConfig, device: Device) -> Self {
         let (optimizer, loss) = (StageOptimizer::new(optimizer, &device), Loss::default());
-        Self {
-            model,
-            optimizer,
-            device,
-            loss,
-            activation_checkpointing: false,
-            precision: Precision::F32,
-            loss_scale: None,
-        }
+        Self { model, optimizer, device, loss, precision: Precision::F32, loss_scale: None }
     }
 
     /// Makes one update from a batch in `accumulate` micro-batches. An update with a loss or gradient that is not finite is
@@ -82,9 +71,6 @@ impl TrainState {
     /// `accept(loss, grad_norm)`. Every rank makes the same update of the same weights.
     ///
     /// Consumes and returns the state, so that the update writes the weights in place.
-    ///
-    /// # Errors
-    /// Those of the model, of the device and of the other ranks.
     pub fn step_if(
         self,
         batch: &StageBatch,
@@ -93,31 +79,20 @@ impl TrainState {
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
     ) -> Result<(Self, Update), TrainError> {
-        let Self { model, mut optimizer, device, loss, activation_checkpointing, precision, loss_scale } = self;
+        let Self { model, mut optimizer, device, loss, precision, loss_scale } = self;
         let _scope = precision.scope();
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
         let mut accumulator = GradientsAccumulator::<Network>::new();
         let mut sum = (ranks.num_ranks() > 1).then(GradientSum::default);
-        let mut read = HostReads::default();
+        let (mut shares, mut values) = (Vec::new(), Vec::new());
         for (round, micro_batch) in batch.rounds(parts).enumerate() {
             if let Some(MicroBatch { clips, tokens, share }) = micro_batch {
                 let device_batch = DeviceBatch::upload(clips, &device)?;
-                let losses = if activation_checkpointing {
-                    activation_checkpointing::backward(
-                        &model,
-                        &device_batch,
-                        &tokens,
-                        (&loss, batch.step),
-                        share * factor,
-                        &mut accumulator,
-                    )?
-                } else {
-                    let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss, batch.step)?;
-                    let grads = total.clone().mul_scalar(share * factor).backward();
-                    accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
-                    LossParts { total: total.inner(), mse: mse.inner() }
-                };
-                read.add(share, losses);
+                let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss, batch.step)?;
+                let grads = total.clone().mul_scalar(share * factor).backward();
+                accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
+                shares.push(share);
+                values.extend([total.inner(), mse.inner()]);
             }
             if let Some(sum) = &mut sum {
                 sum.add(&model, accumulator.grads(), parts.num_working(round), ranks)?;
@@ -127,7 +102,7 @@ impl TrainState {
             Some(sum) => sum.finish(&model, &device, ranks),
             None => accumulator.grads(),
         };
-        let mut update = read.finish(norm_on_device(&model, &grads), ranks)?;
+        let mut update = read_update(&shares, values, norm_on_device(&model, &grads), ranks)?;
         update.grad_norm /= factor;
         update.applied = accept(update.loss, update.grad_norm);
         let model = if update.applied {
@@ -135,7 +110,7 @@ impl TrainState {
         } else {
             model
         };
-        Ok((Self { model, optimizer, device, loss, activation_checkpointing, precision, loss_scale }, update))
+        Ok((Self { model, optimizer, device, loss, precision, loss_scale }, update))
     }
 
     /// Adapts the loss scale after an update. Returns whether the update overflowed.
@@ -151,43 +126,26 @@ impl TrainState {
     }
 }
 
-/// Values of an update that the host needs. They are read together at the end, because each read waits for the queued work
-/// and leaves a GPU idle.
-#[derive(Default)]
-struct HostReads {
-    shares: Vec<f64>,
-    /// Loss and mean squared error of every part.
-    values: Vec<Tensor<1>>,
-}
-
-impl HostReads {
-    fn add(&mut self, share: f64, parts: LossParts) {
-        self.shares.push(share);
-        self.values.extend([parts.total, parts.mse]);
-    }
-
-    /// Reads the losses of the whole batch, added in the order of its parts, and the gradient norm of rank 0, which decides
-    /// for all; 0 without gradients. The update is not applied yet.
-    fn finish(mut self, grad_norm: Option<Tensor<1>>, ranks: &Ranks) -> Result<Update, TrainError> {
-        self.values.extend(grad_norm);
-        let values =
-            if self.values.is_empty() { Ok(Vec::new()) } else { Tensor::cat(self.values, 0).try_into_vec_as::<f64>() };
-        let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
-        let (losses, norm) = values.split_at(2 * self.shares.len());
-        let own: Vec<_> = losses
-            .as_chunks::<2>()
-            .0
-            .iter()
-            .zip(&self.shares)
-            .map(|(of, share)| of.map(|value| share * value))
-            .collect();
-        let all = ranks.gather((own, norm.first().copied().unwrap_or(0.0)))?;
-        let num_rounds = all[0].0.len();
-        let of = |i: usize| {
-            let in_order =
-                (0..num_rounds).flat_map(|round| all.iter().filter_map(move |(losses, _)| losses.get(round)));
-            in_order.map(|losses| losses[i]).sum()
-        };
-        Ok(Update { loss: of(0), mse: of(1), grad_norm: all[0].1, applied: false })
-    }
+/// Reads the losses and mean squared errors of all parts, added in the order of the parts, and the gradient norm of rank 0,
+/// which decides for all; 0 without gradients. The update is not applied yet. All are read together at the end, because each
+/// read waits for the queued work and leaves a GPU idle.
+fn read_update(
+    shares: &[f64],
+    mut values: Vec<Tensor<1>>,
+    grad_norm: Option<Tensor<1>>,
+    ranks: &Ranks,
+) -> Result<Update, TrainError> {
+    values.extend(grad_norm);
+    let values = if values.is_empty() { Ok(Vec::new()) } else { Tensor::cat(values, 0).try_into_vec_as::<f64>() };
+    let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
+    let (losses, norm) = values.split_at(2 * shares.len());
+    let losses = losses.as_chunks::<2>().0.iter().zip(shares);
+    let own: Vec<_> = losses.map(|(of, share)| of.map(|value| share * value)).collect();
+    let all = ranks.gather((own, norm.first().copied().unwrap_or(0.0)))?;
+    let num_rounds = all[0].0.len();
+    let of = |i: usize| {
+        let in_order = (0..num_rounds).flat_map(|round| all.iter().filter_map(move |(losses, _)| losses.get(round)));
+        in_order.map(|losses| losses[i]).sum()
+    };
+    Ok(Update { loss: of(0), mse: of(1), grad_norm: all[0].1, applied: false })
 }

@@ -2,8 +2,6 @@
 //!
 //! - `scene_set`: a scene file, or the test scenes of a run
 //! - `open_scene`: a scene ready to render, with all that the page shows of it
-//! - `true_frames`: frames with a true image
 
 pub(crate) mod open_scene;
 pub(crate) mod scene_set;
-pub(crate) mod true_frames;

@@ -1,18 +1,17 @@
 //! A scene file, or the test scenes of a run.
 
 use burn::tensor::Device;
+use clift_core::{Camera, ClipViews};
 use clift_data::ClipReader;
-use clift_eval::file_name;
+use clift_eval::{Canvas, file_name};
 use clift_model::{Renderer, TokenCount, TrainedModel};
 use clift_scene::{ContextChoice, Contexts, EncodeOptions, EncodedScene, Scene, TokenCoding, TokenFormat, encode};
 
 use crate::error::ViewError;
 use crate::protocol::request::OpenRequest;
-use crate::scenes::open_scene::{OpenScene, SceneOrigin};
-use crate::scenes::true_frames::{self, TrueImage};
+use crate::scenes::open_scene::{OpenScene, SceneOrigin, TrueFrame};
 
 /// The scenes that a viewer offers.
-#[derive(Debug)]
 pub enum SceneSet {
     /// One scene file.
     File(Box<SceneFile>),
@@ -21,7 +20,6 @@ pub enum SceneSet {
 }
 
 /// A scene file and its renderer.
-#[derive(Debug)]
 pub struct SceneFile {
     /// The scene.
     pub scene: Scene,
@@ -53,17 +51,13 @@ pub struct RunScenes {
     pub render_args: Vec<String>,
 }
 
-impl std::fmt::Debug for RunScenes {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("RunScenes").field("items", &self.items).field("options", &self.options).finish_non_exhaustive()
-    }
-}
+/// Most true frames of a scene in the page's list, spread evenly.
+const MAX_FRAMES: usize = 256;
 
 /// Number format of the scenes of a run.
 const RUN_FORMAT: TokenFormat = TokenFormat::F16;
 
 impl SceneSet {
-    /// Returns the keys of the scenes.
     pub(crate) fn keys(&self) -> Vec<String> {
         match self {
             Self::File(file) => vec![file.scene.key.clone()],
@@ -71,12 +65,6 @@ impl SceneSet {
         }
     }
 
-    /// Whether frames and contexts have true images.
-    pub(crate) fn has_true_images(&self) -> bool {
-        matches!(self, Self::Run(_))
-    }
-
-    /// Opens a scene on the device of its model.
     pub(crate) fn open(&self, request: OpenRequest, device: &Device) -> Result<OpenScene, ViewError> {
         match self {
             Self::File(file) => {
@@ -99,12 +87,12 @@ impl SceneSet {
         }
     }
 
-    /// Reads a true frame of an open scene, by its position in the list.
-    pub(crate) fn true_image(&self, open: &OpenScene, frame: usize) -> Result<TrueImage, ViewError> {
-        check_position("frame", frame, open.origin.frames.len())?;
+    /// Reads a true frame of an open scene, by its position in the list, at the size of the context views.
+    pub(crate) fn true_image(&self, open: &OpenScene, frame: usize) -> Result<(Canvas, Camera), ViewError> {
+        check_position("frame", frame, open.frames.len())?;
         let Self::Run(run) = self else { return Err(ViewError::NoScene) };
-        let (index, _) = run.items[open.origin.index];
-        true_frames::read(&run.reader, index, &open.scene, open.origin.frames[frame])
+        let views = run.reader.read_views(run.items[open.index].0, &[open.frames[frame].frame], &open.scene.world)?;
+        Ok((images(&views)?.remove(0), views.cameras[0]))
     }
 }
 
@@ -125,7 +113,7 @@ impl RunScenes {
             stored_tokens: Some(TokenCount::Count(stored)),
             ..self.options.clone()
         };
-        let EncodedScene { mut scene, context: images, clusters, .. } =
+        let EncodedScene { mut scene, context: context_views, clusters, .. } =
             encode(&self.model, &self.reader, *index, &options)?;
         scene.tokens = RUN_FORMAT.round(&scene.tokens, scene.model.dim)?;
         // The key comes from data: as a file name it must not lead to another folder.
@@ -143,14 +131,23 @@ impl RunScenes {
             index: request.scene,
             coding: RUN_FORMAT.into(),
             file_bytes: scene.file_bytes(RUN_FORMAT),
-            context_images: Some(true_frames::images(&images)?),
+            context_images: Some(images(&context_views)?),
             clusters: Some(clusters.assignment().to_vec()),
-            frames: true_frames::list(&self.reader, *index, &scene)?,
+            frames: self.true_frames(*index, &scene)?,
             storage_counts: counts,
             encode_command: Some(command("clift encode", &encode_args)),
             render_command: command("clift render", &render_args),
         };
         OpenScene::new(scene, self.model.network.renderer.clone(), origin, device)
+    }
+
+    /// Lists the frames that are not context views.
+    fn true_frames(&self, index: usize, scene: &Scene) -> Result<Vec<TrueFrame>, ViewError> {
+        let cameras = self.reader.source.cameras(index)?;
+        let others = cameras.iter().enumerate().filter(|(frame, _)| !scene.context_frames.contains(&(*frame as u32)));
+        let frames: Vec<TrueFrame> =
+            others.map(|(frame, camera)| TrueFrame { frame, c2w: scene.world.normalize(camera.c2w) }).collect();
+        Ok(frames.iter().step_by(frames.len().div_ceil(MAX_FRAMES).max(1)).copied().collect())
     }
 
     /// Returns the offered counts of a scene, ascending; all tokens are always offered.
@@ -171,4 +168,9 @@ fn check_position(name: &'static str, value: usize, count: usize) -> Result<(), 
 fn command(start: &str, args: &[String]) -> String {
     let quoted = args.iter().filter_map(|arg| shlex::try_quote(arg).ok());
     [start.into()].into_iter().chain(quoted).collect::<Vec<_>>().join(" ")
+}
+
+fn images(views: &ClipViews) -> Result<Vec<Canvas>, ViewError> {
+    let images = views.images.chunks_exact(views.height * views.width * 3);
+    images.map(|rgb| Ok(Canvas::from_rgb8(rgb, views.height, views.width)?)).collect()
 }

@@ -9,7 +9,6 @@ use std::net::{IpAddr, SocketAddr};
 
 use axum::http::{HeaderMap, Uri, header};
 
-/// Why a request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// Host that is not an address of this machine.
@@ -21,7 +20,6 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    /// Returns the text of the answer.
     pub fn text(self) -> &'static str {
         match self {
             Self::Host => "clift view answers only to IP addresses and localhost; open the URL that it printed\n",
@@ -31,7 +29,6 @@ impl Refusal {
     }
 }
 
-/// The token of a server.
 #[derive(Clone, Debug)]
 pub struct Access {
     token: String,
@@ -44,7 +41,6 @@ impl Access {
         Self { token: hex::encode(rand::random::<[u8; 16]>()), address }
     }
 
-    /// Returns the URL of the page, with the token.
     pub fn url(&self) -> String {
         format!("http://{}/?token={}", self.address, self.token)
     }

@@ -16,10 +16,11 @@ use clift_model::{DeviceName, Precision, SelectionPreset};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use serde_json::json;
 use tokio::sync::Semaphore;
 
 use crate::error::ViewError;
-use crate::protocol::reply::{Hello, Reply};
+use crate::protocol::reply::message;
 use crate::protocol::request::MAX_REQUEST_BYTES;
 use crate::scenes::scene_set::SceneSet;
 use crate::server::access::Access;
@@ -52,9 +53,6 @@ struct Shared {
 
 impl ViewServer {
     /// Takes the port of the address; 0 takes a free port.
-    ///
-    /// # Errors
-    /// [`ViewError::Bind`] for a port in use or an address of another machine.
     pub fn bind(address: SocketAddr) -> Result<Self, ViewError> {
         let bind = || {
             let listener = TcpListener::bind(address)?;
@@ -76,25 +74,21 @@ impl ViewServer {
     }
 
     /// Renders and serves until serving fails.
-    ///
-    /// # Errors
-    /// [`ViewError::Model`] if the device cannot be opened, [`ViewError::Serve`] if the thread of the connections fails.
     pub fn run(self, scenes: SceneSet, device_name: DeviceName) -> Result<(), ViewError> {
         let device = device_name.open()?;
-        let hello = Hello {
-            scenes: scenes.keys(),
-            device: device_name.to_string(),
-            selections: SelectionPreset::ALL.iter().map(|preset| preset.name()).collect(),
-            default_selection: SelectionPreset::default().name(),
-            precisions: (Precision::ALL.into_iter())
-                .filter(|one| one.check("precision", &device).is_ok())
-                .map(Precision::as_str)
-                .collect(),
-            default_precision: Precision::for_images(&device).as_str(),
-            version: env!("CARGO_PKG_VERSION"),
-        };
+        let selections: Vec<&str> = SelectionPreset::ALL.iter().map(|preset| preset.name()).collect();
+        let precisions = Precision::ALL.into_iter().filter(|one| one.check("precision", &device).is_ok());
+        let hello = json!({
+            "scenes": scenes.keys(),
+            "device": device_name.to_string(),
+            "selections": selections,
+            "default_selection": SelectionPreset::default().name(),
+            "precisions": precisions.map(Precision::as_str).collect::<Vec<_>>(),
+            "default_precision": Precision::for_images(&device).as_str(),
+            "version": env!("CARGO_PKG_VERSION"),
+        });
         let clients = Arc::new(Clients::default());
-        let hello = Reply::Hello(hello).to_bytes(&[]).into();
+        let hello = message("hello", hello, &[]).into();
         let shared = Arc::new(Shared { access: self.access, clients: clients.clone(), hello });
         let serving = std::thread::spawn(move || {
             let clients = shared.clients.clone();

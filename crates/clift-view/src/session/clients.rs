@@ -12,14 +12,12 @@ use crate::protocol::request::{CompareRequest, OpenRequest, Request, ViewRequest
 
 /// Frames that a client may have without acknowledging one.
 pub const MAX_IN_FLIGHT: usize = 2;
-/// Most clients at a time.
 pub const MAX_CLIENTS: usize = 16;
 /// Messages to a client that its socket has not taken.
 const MAX_QUEUED: usize = 4;
 
 pub type ClientId = u64;
 
-/// Work for the render thread.
 #[derive(Debug, PartialEq)]
 pub enum Job {
     Open(OpenRequest),
@@ -29,7 +27,6 @@ pub enum Job {
     Forget,
 }
 
-/// All connected browsers.
 #[derive(Debug, Default)]
 pub struct Clients {
     state: Mutex<State>,
@@ -66,7 +63,6 @@ impl Client {
         self.sender.capacity() > 0 && (self.open.is_some() || self.can_view() || self.compare.is_some())
     }
 
-    /// Takes the next job of a client that is ready.
     fn take_job(&mut self) -> Option<Job> {
         if let Some(open) = self.open.take() {
             return Some(Job::Open(open));
@@ -222,20 +218,6 @@ mod tests {
     }
 
     #[test]
-    fn a_client_that_reads_nothing_gets_no_more_work() {
-        let clients = Clients::default();
-        let (id, _messages) = clients.add().unwrap();
-        let open = OpenRequest { scene: 0, stored: None };
-        for _ in 0..MAX_QUEUED {
-            clients.post(id, Request::Open(open));
-            assert_eq!(clients.next_job(), Some((id, Job::Open(open))));
-            clients.send(id, Vec::new(), None);
-        }
-        clients.post(id, Request::Open(open));
-        assert!(is_idle(&clients));
-    }
-
-    #[test]
     fn clients_are_served_in_turn() {
         let clients = Clients::default();
         let all: Vec<_> = (0..3).map(|_| clients.add().unwrap()).collect();
@@ -261,17 +243,24 @@ mod tests {
     }
 
     #[test]
-    fn removed_clients_leave_nothing_behind_and_the_number_is_bounded() {
+    fn the_number_of_clients_and_of_their_messages_is_bounded() {
         let clients = Clients::default();
         let ids: Vec<_> = (0..MAX_CLIENTS).map(|_| clients.add().unwrap()).collect();
         assert!(clients.add().is_none());
-        clients.post(ids[3].0, view(1));
-        clients.remove(ids[3].0);
-        assert_eq!(clients.next_job(), Some((ids[3].0, Job::Forget)));
-        assert!(is_idle(&clients));
-        clients.post(ids[3].0, view(2));
-        clients.send(ids[3].0, Vec::new(), None);
-        assert!(clients.add().is_some());
+        let id = ids[3].0;
+        let open = OpenRequest { scene: 0, stored: None };
+        for _ in 0..MAX_QUEUED {
+            clients.post(id, Request::Open(open));
+            assert_eq!(clients.next_job(), Some((id, Job::Open(open))));
+            clients.send(id, Vec::new(), None);
+        }
+        clients.post(id, view(1));
+        assert!(is_idle(&clients), "a client that reads nothing gets no more work");
+        clients.remove(id);
+        assert_eq!(clients.next_job(), Some((id, Job::Forget)));
+        clients.post(id, view(2));
+        clients.send(id, Vec::new(), None);
+        assert!(is_idle(&clients) && clients.add().is_some());
         clients.close();
         assert_eq!(clients.next_job(), None);
     }

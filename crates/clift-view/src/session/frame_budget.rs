@@ -8,14 +8,12 @@ const FAST: f64 = 0.6;
 /// Fast frames before the settings are raised by a step.
 const PATIENCE: u32 = 12;
 
-/// The reductions in force for a client.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameBudget {
     level: usize,
     num_fast: u32,
 }
 
-/// Settings of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameSettings {
     pub tokens: usize,
@@ -24,7 +22,6 @@ pub struct FrameSettings {
 }
 
 impl FrameBudget {
-    /// Returns the settings of the next frame for the wanted ones.
     pub fn reduce(self, wanted: FrameSettings) -> FrameSettings {
         let token_steps = self.level.min(TOKEN_STEPS);
         let tokens = (wanted.tokens as f64 * TOKEN_FACTOR.powi(token_steps as i32)) as usize;
@@ -55,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tokens_fall_first_then_size() {
+    fn tokens_fall_first_then_size_and_fast_frames_restore_both() {
         let wanted = FrameSettings { tokens: 256, size: 2 };
         let mut budget = FrameBudget::default();
         let mut seen = vec![budget.reduce(wanted)];
@@ -63,28 +60,14 @@ mod tests {
             budget.record(0.04, 0.03, wanted);
             seen.push(budget.reduce(wanted));
         }
-        assert_eq!(seen[0], wanted);
-        assert_eq!(seen[1], FrameSettings { tokens: 192, size: 2 });
-        assert_eq!(seen[7], FrameSettings { tokens: 34, size: 2 });
-        assert_eq!(seen[8], FrameSettings { tokens: 34, size: 1 });
-        assert_eq!(seen[20], FrameSettings { tokens: 34, size: 0 });
+        let at = |i: usize| (seen[i].tokens, seen[i].size);
+        assert_eq!([0, 1, 7, 8, 20].map(at), [(256, 2), (192, 2), (34, 2), (34, 1), (34, 0)]);
         assert_eq!(budget.reduce(FrameSettings { tokens: 1, size: 0 }).tokens, 1);
-    }
-
-    #[test]
-    fn fast_frames_restore_the_settings_and_fitting_ones_keep_them() {
-        let wanted = FrameSettings { tokens: 256, size: 1 };
-        let mut budget = FrameBudget::default();
-        budget.record(0.1, 0.03, wanted);
-        let reduced = budget.reduce(wanted);
-        assert_eq!(reduced.tokens, 144, "two steps");
-        for _ in 0..100 {
-            budget.record(0.025, 0.03, wanted);
-        }
-        assert_eq!(budget.reduce(wanted), reduced);
-        for _ in 0..2 * PATIENCE {
-            budget.record(0.01, 0.03, wanted);
-        }
+        (0..100).for_each(|_| budget.record(0.025, 0.03, wanted));
+        assert_eq!(budget.reduce(wanted), seen[20], "frames that fit keep the settings");
+        (0..9 * PATIENCE).for_each(|_| budget.record(0.01, 0.03, wanted));
         assert_eq!(budget.reduce(wanted), wanted);
+        budget.record(0.1, 0.03, wanted);
+        assert_eq!(budget.reduce(wanted).tokens, 144, "two steps");
     }
 }

@@ -10,32 +10,27 @@ use clift_data::{encode_jpeg, encode_png};
 use clift_eval::Canvas;
 use clift_model::{PatchGrids, SelectionPreset, psnr};
 use clift_scene::SceneRenderer;
+use serde_json::json;
 
 use crate::error::ViewError;
-use crate::protocol::reply::{Comparison, Frame, Reply};
+use crate::protocol::reply::message;
 use crate::protocol::request::{CompareRequest, OpenRequest, ViewRequest};
 use crate::scenes::open_scene::{OpenScene, png, scene_camera};
 use crate::scenes::scene_set::SceneSet;
-use crate::scenes::true_frames::TrueImage;
 use crate::session::clients::{ClientId, Clients, Job};
 use crate::session::frame_budget::{FrameBudget, FrameSettings};
 
 /// Scenes that stay on the device without a client.
 const KEPT_SCENES: usize = 3;
-/// True images that stay decoded.
-const KEPT_IMAGES: usize = 16;
 
 /// JPEG quality of the frames while the camera moves.
 const JPEG_QUALITY: u8 = 90;
 
-/// The scenes of all clients.
 pub struct RenderLoop {
     scenes: SceneSet,
     device: Device,
     /// The scenes opened last, the latest at the end.
     open: Vec<Arc<OpenScene>>,
-    /// True images read last, by scene and position of the frame.
-    true_images: Vec<([usize; 2], TrueImage)>,
     views: HashMap<ClientId, ClientView>,
 }
 
@@ -49,7 +44,7 @@ struct ClientView {
 
 impl RenderLoop {
     pub fn new(scenes: SceneSet, device: Device) -> Self {
-        Self { scenes, device, open: Vec::new(), true_images: Vec::new(), views: HashMap::new() }
+        Self { scenes, device, open: Vec::new(), views: HashMap::new() }
     }
 
     /// Works until the clients are closed.
@@ -66,15 +61,15 @@ impl RenderLoop {
                 Job::Compare(request) => self.compare(id, &request),
             };
             match result {
-                Ok(message) => clients.send(id, message, frame),
-                Err(error) => clients.send(id, Reply::Failure { message: error.to_string() }.to_bytes(&[]), None),
+                Ok(reply) => clients.send(id, reply, frame),
+                Err(error) => clients.send(id, message("failure", json!({"message": error.to_string()}), &[]), None),
             }
         }
     }
 
     fn open(&mut self, id: ClientId, request: OpenRequest) -> Result<Vec<u8>, ViewError> {
         let is_wanted = |open: &Arc<OpenScene>| {
-            open.origin.index == request.scene && request.stored.is_none_or(|stored| stored == open.scene.num_tokens())
+            open.index == request.scene && request.stored.is_none_or(|stored| stored == open.scene.num_tokens())
         };
         let scene = match self.open.iter().position(is_wanted) {
             Some(position) => self.open.remove(position),
@@ -84,11 +79,11 @@ impl RenderLoop {
             self.open.remove(0);
         }
         self.open.push(scene.clone());
-        let message = scene.reply(self.scenes.has_true_images())?;
+        let reply = scene.message.clone();
         let (renderer, selection) = (scene.renderer.clone(), SelectionPreset::default());
         let budget = self.views.get(&id).map_or_else(FrameBudget::default, |view| view.budget);
         self.views.insert(id, ClientView { scene, renderer, selection, budget });
-        Ok(message)
+        Ok(reply)
     }
 
     fn view(&mut self, id: ClientId, request: &ViewRequest) -> Result<Vec<u8>, ViewError> {
@@ -116,52 +111,44 @@ impl RenderLoop {
         let rgb = Canvas::from_unit(&view.pixels, height, width)?.as_rgb8().to_vec();
         let image = RgbImage { width, height, rgb };
         let picture = if request.rest { encode_png(&image)? } else { encode_jpeg(&image, JPEG_QUALITY)? };
-        let frame = Frame {
-            seq: request.seq,
-            rest: request.rest,
-            format: if request.rest { "png" } else { "jpeg" },
-            size: [width, height],
-            tokens: view.tokens.as_ref().map_or(stored, Vec::len),
-            stored,
-            select_ms: 1e3 * view.select_s,
-            render_ms: 1e3 * view.render_s,
-            encode_ms: 1e3 * started.elapsed().as_secs_f64(),
-        };
+        let frame = json!({
+            "seq": request.seq,
+            "rest": request.rest,
+            "format": if request.rest { "png" } else { "jpeg" },
+            "size": [width, height],
+            "tokens": view.tokens.as_ref().map_or(stored, Vec::len),
+            "stored": stored,
+            "select_ms": 1e3 * view.select_s,
+            "render_ms": 1e3 * view.render_s,
+            "encode_ms": 1e3 * started.elapsed().as_secs_f64(),
+        });
         let bits = if request.list_tokens { token_bits(view.tokens.as_deref(), stored) } else { Vec::new() };
         if let Some(budget_s) = budget_s {
             budget.record(begun.elapsed().as_secs_f64(), budget_s, wanted);
         }
-        Ok(Reply::Frame(frame).to_bytes(&[&bits, &picture]))
+        Ok(message("frame", frame, &[&bits, &picture]))
     }
 
     fn compare(&mut self, id: ClientId, request: &CompareRequest) -> Result<Vec<u8>, ViewError> {
         let scene = self.views.get(&id).ok_or(ViewError::NoScene)?.scene.clone();
-        let key = [scene.origin.index, request.frame];
-        let image = match self.true_images.iter().position(|(one, _)| *one == key) {
-            Some(position) => self.true_images.remove(position).1,
-            None => self.scenes.true_image(&scene, request.frame)?,
-        };
-        if self.true_images.len() >= KEPT_IMAGES {
-            self.true_images.remove(0);
-        }
+        let (image, camera) = self.scenes.true_image(&scene, request.frame)?;
         let [width, height] = [scene.scene.width, scene.scene.height];
         let tokens = request.tokens.clamp(1, scene.scene.num_tokens());
         let mut renderer = scene.renderer.clone();
         renderer.set_rules(request.selection.rules());
         let _precision = request.precision.scope();
-        let view = renderer.render(&[image.camera], height, width, tokens)?.remove(0);
-        let target: Vec<f32> = image.image.as_rgb8().iter().map(|&value| f32::from(value) / 255.0).collect();
-        let comparison = Comparison {
-            frame: request.frame,
-            camera: scene_camera(scene.origin.frames[request.frame].frame, &image.camera, [width, height]),
-            tokens,
+        let view = renderer.render(&[camera], height, width, tokens)?.remove(0);
+        let target: Vec<f32> = image.as_rgb8().iter().map(|&value| f32::from(value) / 255.0).collect();
+        let comparison = json!({
+            "frame": request.frame,
+            "camera": scene_camera(scene.frames[request.frame].frame, &camera, [width, height]),
+            "tokens": tokens,
             // JSON cannot represent infinity.
-            psnr: psnr(&view.pixels, &target)?.min(100.0),
-        };
-        let true_png = if request.image { vec![png(&image.image)?] } else { Vec::new() };
+            "psnr": psnr(&view.pixels, &target)?.min(100.0),
+        });
+        let true_png = if request.image { vec![png(&image)?] } else { Vec::new() };
         let parts: Vec<&[u8]> = true_png.iter().map(Vec::as_slice).collect();
-        self.true_images.push((key, image));
-        Ok(Reply::Comparison(comparison).to_bytes(&parts))
+        Ok(message("comparison", comparison, &parts))
     }
 }
 

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::{ClipReader, Split, plural};
-use clift_eval::{EvalFrames, EvalSplit, table};
-use clift_scene::{FittedCodec, TokenCodec};
+use clift_eval::{EvalFrames, EvalSplit};
+use clift_scene::TokenCodec;
 use clift_train::{fit_token_codec, lock_run};
 
 use crate::commands::args::model_args::ModelArgs;
@@ -13,7 +13,7 @@ use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::interrupt::{self, Ending};
 use crate::output::output_file::OutputFile;
-use crate::output::progress_sink::progress_sink;
+use crate::output::progress::progress_sink;
 use crate::output::stdout::print_result;
 
 #[derive(Debug, clap::Args)]
@@ -34,7 +34,7 @@ pub struct CodecArgs {
     pub overrides: ConfigArgs,
 }
 
-/// Fits the codec of a model and prints its rates.
+/// Fits the codec of a model.
 pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
     let mut sink = progress_sink();
     // A run in training writes its codec itself.
@@ -50,38 +50,7 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
     let model = model_args.open()?;
     let frames = EvalFrames { split: EvalSplit::Train, hold_out };
     let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
-    let fitted = fit_token_codec(config, (&model, &path.weights), (&reader, frames), &stop, sink.as_mut())?;
+    let num_scenes = fit_token_codec(config, (&model, &path.weights), (&reader, frames), &stop, sink.as_mut())?;
     drop(sink);
-    print_result(&describe(&fitted, &out.display().to_string()))
-}
-
-/// Returns the rates by count and step, and the bits beside the entropy.
-fn describe(fitted: &FittedCodec, path: &str) -> String {
-    let FittedCodec { codec, stream_and_entropy_bits, num_values, num_scenes } = fitted;
-    let (rates, dim) = (&codec.rates, codec.model.dim as f64);
-    let header = ["share of tokens", "step", "bits a value", "loss, dB", "PSNR, dB"];
-    let rows = rates.shares.iter().enumerate().flat_map(|(c, share)| {
-        rates.steps.iter().enumerate().map(move |(k, step)| {
-            let at = c * rates.steps.len() + k;
-            [
-                format!("{share:.4}"),
-                format!("{step:.4}"),
-                format!("{:.3}", rates.bits[at] / dim),
-                format!("{:.4}", rates.loss[at]),
-                format!("{:.2}", rates.psnr[c] - rates.loss[at]),
-            ]
-        })
-    });
-    let bounds = rates.steps.iter().zip(stream_and_entropy_bits).map(|(step, [stream, entropy])| {
-        let [stream, entropy] = [stream, entropy].map(|bits| bits / (*num_values).max(1) as f64);
-        let above = format!("{:+.2} %", 100.0 * (stream / entropy - 1.0));
-        [format!("{step:.4}"), format!("{stream:.4}"), format!("{entropy:.4}"), above]
-    });
-    format!(
-        "{path}: fitted on {}, {num_values} values measured\n{}\n\nbits a value of the streams, and the \
-         entropy of the levels by direction\n{}",
-        plural(*num_scenes, "scene"),
-        table(header, rows),
-        table(["step", "stream", "entropy", "above"], bounds),
-    )
+    print_result(&format!("{}: fitted on {}", out.display(), plural(num_scenes, "scene")))
 }

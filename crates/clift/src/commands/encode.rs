@@ -1,20 +1,21 @@
 //! `clift encode`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use clift_data::{ClipReader, SceneSource, SceneSubset, Split};
 use clift_model::TokenCount;
 use clift_scene::{
-    ClusterMap, Coding, ContextChoice, EncodeOptions, Scene, SceneError, SceneOptions, TokenCoding, check_output_path,
-    encode_scene, find_scene, frame_positions,
+    ContextChoice, EncodeOptions, Scene, SceneError, SceneOptions, TokenCoding, check_output_path, encode_scene,
+    find_scene, frame_positions,
 };
 
-use crate::commands::args::model_args::{ModelArgs, PhotoCrop};
-use crate::commands::args::parse::{parse_hold_out, parse_kb, parse_loss, parse_output, parse_split};
+use crate::commands::args::model_args::ModelArgs;
+use crate::commands::args::parse::{parse_hold_out, parse_split};
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::exit_code::{UsageError, usage_bail};
-use crate::output::output_file::{OutputFile, is_same_file};
+use crate::exit_code::UsageError;
+use crate::output::counter::Counter;
+use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_note;
 use crate::output::written_scene::print_scene;
 
@@ -43,61 +44,41 @@ pub struct EncodeArgs {
     pub split: Split,
     /// Context frames by position or file name, encoded together [default: groups of neighbours]
     ///
-    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension and folders:
+    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
     /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. Numbers alone are positions, unless one begins with a zero:
     /// `0005` is a name. By default, a DIR of the command line is encoded in groups of neighbours, as many views each as in
     /// training, that together contain every photo (up to 128); a view is rendered from the groups nearest to it. A scene of
     /// the run's data, or of a network with learned tokens, has one group along the camera path.
-    #[arg(long, value_name = "FRAMES", value_delimiter = ',', conflicts_with_all = ["near", "groups"])]
+    #[arg(long, value_name = "FRAMES", value_delimiter = ',', conflicts_with = "near")]
     pub context: Vec<String>,
     /// Encode this frame and those nearest to it, as one group
-    #[arg(long, value_name = "FRAME", conflicts_with = "groups")]
+    #[arg(long, value_name = "FRAME")]
     pub near: Option<String>,
-    /// Part of each photo to encode
-    ///
-    /// Networks trained with a single image size always have the middle.
-    #[arg(long, value_name = "PART", value_enum, default_value_t)]
-    pub crop: PhotoCrop,
-    /// Number of groups of neighbours [default: 3 for every 4 photos]
-    ///
-    /// Few groups leave photos out. The default falls where a number of --stored-tokens is less than 32 a group.
-    #[arg(long, value_name = "COUNT")]
-    pub groups: Option<usize>,
     /// Leave one of N photos out, and compare it with its rendering
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = parse_hold_out)]
     pub hold_out: usize,
-    /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
+    /// Tokens to store, as a number or a share [default: 1/4]
     ///
-    /// With many groups the default falls to 1/8.
+    /// With many groups the default falls to 1/8. Few groups, which leave photos out, hold a number less than 32 a group.
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
     /// Format of the tokens: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]
     ///
     /// `coded` needs the token codec of the model, which training fits (`clift codec` for other models). Its step is the
     /// one that lost 0.02 dB on training scenes, or DB with `coded-DB`.
-    #[arg(long, value_name = "FORMAT", conflicts_with_all = ["quality", "size_kb"])]
+    #[arg(long, value_name = "FORMAT")]
     pub format: Option<TokenCoding>,
-    /// Code the tokens with at most this loss of PSNR in dB, measured on this scene
-    #[arg(long, value_name = "DB", value_parser = parse_loss, conflicts_with = "size_kb")]
-    pub quality: Option<f64>,
-    /// Code the tokens into a file of at most N kB
+    /// Fit the tokens to the photos of a capture, in this many steps, such as 30
     ///
-    /// Without --stored-tokens, the number of tokens is the one with the best expected PSNR at this size.
-    #[arg(long, value_name = "N", value_parser = parse_kb)]
-    pub size_kb: Option<f64>,
-    /// Also write the cluster of every token, as JSON
-    #[arg(long, value_name = "FILE", value_parser = parse_output)]
-    pub save_clusters: Option<PathBuf>,
+    /// Gradient descent through the renderer, for every group of neighbours: less blur between the photos, at about ten times
+    /// the time.
+    #[arg(long, value_name = "STEPS", default_value_t = 0, hide_default_value = true)]
+    pub refine: usize,
     #[command(flatten)]
     pub overrides: ConfigArgs,
 }
 
 impl EncodeArgs {
-    fn coding(&self) -> Option<Coding> {
-        let size = self.size_kb.map(|kb| Coding::Bytes((kb * 1e3) as u64));
-        self.quality.map(Coding::MeasuredLoss).or(size).or(self.format.map(Coding::from))
-    }
-
     /// Returns the context views; `names` are those of all frames.
     fn contexts(&self, model: &ModelArgs, names: &[String]) -> Result<ContextChoice, SceneError> {
         let num_views = model.config.data.views.max_context;
@@ -106,7 +87,7 @@ impl EncodeArgs {
             return Ok(ContextChoice::Near { frame, num_views });
         }
         if self.context.is_empty() {
-            return Ok(model.context(self.groups));
+            return Ok(model.context());
         }
         Ok(ContextChoice::Frames(frame_positions(&self.context, names)?))
     }
@@ -129,17 +110,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
     // `check_output_path` refuses files that are not scenes, and no input is a scene.
     OutputFile::new(&args.out, args.force, &[])?;
-    let inputs: Vec<&Path> =
-        [Some(&args.model), args.data.as_ref()].into_iter().flatten().map(PathBuf::as_path).collect();
-    let clusters = args.save_clusters.as_ref().map(|path| OutputFile::new(path, args.force, &inputs)).transpose()?;
-    if args.save_clusters.as_ref().is_some_and(|path| is_same_file(path, &args.out)) {
-        usage_bail!("--save-clusters and -o name one file, {}; choose another name", args.out.display());
-    }
     let model_args = ModelArgs::find(&args.model, args.data.as_deref(), &args.overrides)?;
     let ModelArgs { given, path, config, .. } = &model_args;
-    if !config.model.architecture.supports_clusters() && args.save_clusters.is_some() {
-        usage_bail!("--save-clusters: the tokens of {} are not clustered; leave the option out", given.display());
-    }
     let source = model_args.open_data(args.split)?.source;
     let (source, scene) = readable_scene(source, args.scene.as_deref())?;
     let encode = EncodeOptions {
@@ -151,13 +123,16 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         seed: config.seed,
         model_path: Scene::model_path_for(given, &args.out),
     };
-    let options = SceneOptions { encode, coding: args.coding(), weights: path.weights.clone(), out: args.out.clone() };
-    let options_of_views = model_args.clip_options(source.as_ref(), scene, args.crop)?;
+    let (weights, out) = (path.weights.clone(), args.out.clone());
+    let options = SceneOptions { encode, refine_steps: args.refine, coding: args.format, weights, out };
+    let options_of_views = model_args.clip_options(source.as_ref(), scene)?;
     let reader = ClipReader { source, options: options_of_views };
-    let written = encode_scene(&model_args.open()?, &reader, scene, &options)?;
-    if let Some(file) = clusters {
-        file.write_json(&ClusterMap::new(&written.encoded))?;
-    }
+    let mut counter = None;
+    let mut progress = |done: usize, total: usize| {
+        counter.get_or_insert_with(|| Counter::new("groups refined", total as u64)).set(done as u64);
+    };
+    let written = encode_scene(&model_args.open()?, &reader, scene, &options, &mut progress)?;
+    drop(counter);
     // Contexts of a run's own data show how well it is trained, not how far apart they are.
     print_scene(&written, &args.out, &given.display().to_string(), model_args.folder.is_some())
 }

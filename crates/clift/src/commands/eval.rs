@@ -3,21 +3,20 @@
 use std::path::{Path, PathBuf};
 
 use clift_data::{SourceKind, Split};
-use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
+use clift_eval::{Experiment, Selection};
 use clift_model::{ModelPath, TokenCount};
 use clift_scene::TokenCoding;
-use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
+use clift_train::{Config, EvalFolder, Run, evaluate_model};
 
 use crate::commands::args::model_args::check_network;
-use crate::commands::args::parse::{parse_bytes, parse_run, parse_split};
+use crate::commands::args::parse::{parse_run, parse_split};
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt::{self, Ending};
-use crate::output::progress_sink::progress_sink;
+use crate::output::progress::progress_sink;
 use crate::output::stdout::{print_evaluation, print_warning};
 
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
-    let external = external_methods(args)?;
     let model = args.checkpoint.as_deref().map(ModelPath::find).transpose()?;
     let folder = match (&model, &args.run) {
         (Some(model), _) => &model.dir,
@@ -46,12 +45,12 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let mut sink = progress_sink();
     let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
     let folder = EvalFolder::open(&out, args.force, sink.as_mut())?;
-    let request = EvalRequest { split: args.split, external: &external, folder: &folder };
+    let output = (args.split, &folder);
     let summary = match &model {
-        None => Run::reopen(config)?.evaluate(&request, &with, &stop, sink.as_mut())?,
+        None => Run::reopen(config)?.evaluate(output, &with, &stop, sink.as_mut())?,
         Some(model) => {
             let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
-            evaluate_model(config, model, stage1.as_ref(), &request, &stop, sink.as_mut())?
+            evaluate_model(config, model, stage1.as_ref(), output, &stop, sink.as_mut())?
         }
     };
     drop(sink);
@@ -93,28 +92,6 @@ fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     Ok(config)
 }
 
-fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
-    let EvalArgs { predictions, name, data_size, .. } = args;
-    for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
-        if count != 0 && count != predictions.len() {
-            usage_bail!("{} --predictions but {count} {flag}: give one for each, in order", predictions.len());
-        }
-    }
-    let mut methods: Vec<ExternalMethod> = Vec::new();
-    for (i, folder) in predictions.iter().enumerate() {
-        if !folder.is_dir() {
-            usage_bail!("--predictions: no folder {}", folder.display());
-        }
-        let folder_name = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
-        let name = MethodName::new(&name.get(i).cloned().unwrap_or_else(folder_name))?;
-        if methods.iter().any(|method| method.name == name) {
-            usage_bail!("two --predictions have the name {}: set distinct names with --name", name.as_str());
-        }
-        methods.push(ExternalMethod { name, folder: folder.clone(), data_bytes: data_size.get(i).copied() });
-    }
-    Ok(methods)
-}
-
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
     /// Run directory
@@ -154,15 +131,6 @@ pub struct EvalArgs {
     /// Formats of the tokens: f32, f16, int8, coded, or coded-DB, e.g. f16,coded-0.1
     #[arg(long = "format", value_delimiter = ',', value_name = "FORMAT")]
     pub formats: Vec<TokenCoding>,
-    /// Also score the target images of an external method; repeatable
-    #[arg(long, value_name = "DIR")]
-    pub predictions: Vec<PathBuf>,
-    /// Display name of each --predictions folder, in order [default: folder name]
-    #[arg(long, value_name = "NAME", requires = "predictions")]
-    pub name: Vec<String>,
-    /// Stored bytes per scene of each --predictions folder, in order, e.g. 12.5MB
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, requires = "predictions")]
-    pub data_size: Vec<u64>,
     /// Evaluation index (JSON): context and target frames of every scene
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,

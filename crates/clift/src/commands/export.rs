@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
+use clap::builder::PossibleValuesParser;
 use clift_model::ModelPath;
-use clift_train::{Config, ExportFormat, export, read_config, require_absent};
+use clift_train::{Config, export_f16, read_config, require_absent};
 
-use crate::commands::args::parse::parse_format;
 use crate::output::stdout::print_result;
 
 #[derive(Debug, clap::Args)]
@@ -13,14 +13,11 @@ pub struct ExportArgs {
     /// Model directory, run directory, or model.safetensors in one of them
     #[arg(value_name = "MODEL|RUN")]
     pub model: PathBuf,
-    /// Format: pytorch (for torch.load), safetensors, or f16
-    ///
-    /// The first two have the names of published checkpoints. `f16` writes a model directory with the weights rounded to
-    /// f16, which every command reads; fit its token codec with `clift codec`.
-    #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
-    pub format: ExportFormat,
-    /// File to write; a directory for f16
-    #[arg(long, short, value_name = "FILE|DIR")]
+    /// Format: f16, a model directory with the weights rounded to f16; fit its token codec with `clift codec`
+    #[arg(long, value_name = "FORMAT", value_parser = PossibleValuesParser::new(["f16"]))]
+    pub format: String,
+    /// Model directory to write
+    #[arg(long, short, value_name = "DIR")]
     pub out: PathBuf,
 }
 
@@ -28,14 +25,6 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
     require_absent(&args.out)?;
     let model = ModelPath::find(&args.model)?;
     let (config, _) = read_config::<Config>(&model.dir.join("config.toml"), &[])?;
-    let exported = export(&config, &model, args.format, &args.out)?;
-    let condenser = if exported.has_condenser { "with condenser" } else { "without condenser" };
-    print_result(&format!(
-        "{}: {} tensors, {} values, {} {condenser}, from {}",
-        args.out.display(),
-        exported.num_tensors,
-        exported.num_values,
-        config.model.variant,
-        model.weights.display(),
-    ))
+    let num_values = export_f16(&config, &model, &args.out)?;
+    print_result(&format!("{}: {num_values} values in f16, from {}", args.out.display(), model.weights.display()))
 }

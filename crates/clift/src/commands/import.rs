@@ -3,9 +3,8 @@
 use std::path::PathBuf;
 
 use clift_model::CliftVariant;
-use clift_train::{ImportOptions, ImportRecord, import};
+use clift_train::{ImportRecord, import};
 
-use crate::commands::args::parse::parse_rename;
 use crate::interrupt::{self, Ending};
 use crate::output::stdout::print_result;
 
@@ -22,25 +21,14 @@ pub struct ImportArgs {
     pub out: PathBuf,
     /// Number of attention heads [default: 8 for the published width 768]
     ///
-    /// Tensor shapes do not determine the number of heads, except for released-dl3dv. `clift export` stores it.
+    /// Tensor shapes do not determine the number of heads, except for released-dl3dv.
     #[arg(long, value_name = "COUNT")]
     pub num_heads: Option<usize>,
-    /// Accept f16, bf16 and f64 parameters and convert them to f32
-    #[arg(long)]
-    pub convert: bool,
-    /// Replace part of every parameter name, e.g. `attn.qn=attn.q_norm`; repeatable
-    #[arg(long, value_name = "FROM=TO", value_parser = parse_rename)]
-    pub rename: Vec<(String, String)>,
 }
 
 pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
-    let options = ImportOptions {
-        variant: args.variant,
-        num_heads: args.num_heads,
-        convert: args.convert,
-        renames: args.rename.clone(),
-    };
-    let (config, record) = import(&args.file, &args.out, &options, &*interrupt::flag(Ending::WITHOUT_RESULTS)?)?;
+    let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
+    let (config, record) = import(&args.file, &args.out, (args.variant, args.num_heads), &stop)?;
     let model = &config.model;
     let mut lines: Vec<String> =
         record.parameters.iter().map(|(key, paths)| format!("{key} -> {}", paths.join(", "))).collect();

@@ -123,7 +123,6 @@ fn scalars(rows: &Rows, stage: Stage) -> impl Iterator<Item = Scalar<'static>> {
     })
 }
 
-/// Arguments of `clift metrics`.
 #[derive(Debug, clap::Args)]
 pub struct MetricsArgs {
     /// Run directory, also of a run that is training

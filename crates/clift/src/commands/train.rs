@@ -6,22 +6,38 @@ use std::rc::Rc;
 use clift_eval::available_bytes;
 use clift_model::peak_flops;
 use clift_train::{
-    BatchParts, Config, Event, Ranks, Run, RunEstimate, RunOptions, RunStep, Stage, StageSettings, estimate_run,
-    memory_warning,
+    BatchParts, Config, Event, Launched, RankPlace, Ranks, Run, RunEstimate, RunOptions, RunStep, Stage, StageSettings,
+    TrainError, estimate_run, memory_warning,
 };
 
-use crate::commands::args::adapter::name_adapter;
-use crate::commands::args::parse::{parse_count, parse_training_step};
+use crate::commands::args::parse::parse_training_step;
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::commands::ranks::{connect, finish};
 use crate::interrupt::{self, Ending};
-use crate::output::progress_sink::progress_sink;
-use crate::output::stdout::{print_run, print_warning};
+use crate::output::progress::progress_sink;
+use crate::output::stdout::{name_adapter, print_run, print_warning};
 use crate::output::units::duration;
+use crate::threads;
+use crate::verbosity::Verbosity;
 
+/// Trains on the ranks that a launcher started. Rank 0 alone returns an error, its own or that of another rank: a launcher ends
+/// the other ranks with the first that fails.
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let ranks = connect()?;
-    finish(&ranks, train(args, &ranks))
+    let result = ranks.finish(train(args, &ranks));
+    if ranks.is_root() { result } else { Ok(()) }
+}
+
+/// Connects the processes of a launcher, and gives each its share of the cores. From now on only rank 0 prints.
+fn connect() -> Result<Rc<Ranks>, TrainError> {
+    let launched = Launched::find();
+    if launched.rank > 0 {
+        Verbosity::Silent.choose();
+    }
+    let ranks = launched.connect()?;
+    if ranks.num_ranks() > 1 {
+        threads::start(Some(RankPlace::find(&ranks)?.num_threads));
+    }
+    Ok(Rc::new(ranks))
 }
 
 fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
@@ -37,7 +53,7 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     }
     name_adapter(config.device, true);
     let stop = interrupt::flag(Ending::RUN)?;
-    let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
+    let options = RunOptions { only: args.only, fresh: args.fresh };
     let mut sink = progress_sink();
     let (planned, num_ranks) = (config.clone(), ranks.num_ranks());
     // The first measured steps tell the time of the later stages, too.
@@ -71,13 +87,7 @@ pub struct TrainArgs {
     /// Run one stage: stage1, clusters or stage2
     #[arg(long, value_name = "STAGE", value_parser = parse_training_step)]
     pub only: Option<RunStep>,
-    /// Train and evaluate on the first K training scenes
-    #[arg(long, value_name = "K", value_parser = parse_count)]
-    pub overfit: Option<usize>,
     /// Start a new run; the existing run directory is renamed
     #[arg(long)]
     pub fresh: bool,
-    /// Extend an existing run to more steps, with the learning rates of the new count
-    #[arg(long, conflicts_with = "fresh")]
-    pub extend: bool,
 }

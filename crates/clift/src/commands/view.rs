@@ -10,10 +10,10 @@ use clift_model::{DeviceName, ModelConfig, is_shipped};
 use clift_scene::{ContextChoice, Contexts, EncodeOptions, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ViewServer};
 
-use crate::commands::args::model_args::{ModelArgs, PhotoCrop, default_model, is_data};
+use crate::commands::args::model_args::{ModelArgs, default_model, is_data};
 use crate::commands::args::parse::parse_split;
 use crate::commands::args::shared_args::ConfigArgs;
-use crate::commands::render::run::scene_weights;
+use crate::commands::render::scene_weights;
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result, print_warning};
 
@@ -107,7 +107,7 @@ fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceNa
     let is_training_data = model_args.folder.is_none();
     let frames = EvalFrames::new(&opened, args.split, model_args.config.data.hold_out, is_training_data);
     // The pages of all scenes have images of one size.
-    let options = model_args.clip_options(opened.source.as_ref(), 0, PhotoCrop::Whole)?;
+    let options = model_args.clip_options(opened.source.as_ref(), 0)?;
     let reader = ClipReader { source: opened.source, options };
     // The index of a run lists frames of its own data.
     let has_index = args.overrides.set.iter().any(|set| set.starts_with("eval.index"));
@@ -160,7 +160,7 @@ fn folder_items(
     let count = source.num_scenes().min(MAX_SCENES);
     let (mut items, mut skip_report) = (Vec::with_capacity(count), SkipReport::new(count));
     for scene in 0..count {
-        let context = model_args.context(None);
+        let context = model_args.context();
         match Contexts::choose(reader, scene, &EncodeOptions { context: context.clone(), ..EncodeOptions::default() }) {
             Ok(_) => items.push((scene, context)),
             Err(error) => skip_report.skip(source.key(scene), error.to_string()),

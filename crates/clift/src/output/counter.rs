@@ -1,17 +1,27 @@
 //! Progress of counted work outside training.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, stderr};
 use std::time::{Duration, Instant};
 
-use indicatif::ProgressBar;
+use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::output::bar::progress_bar;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
-use crate::output::visible::visible;
 use crate::verbosity::Verbosity;
 
-const INTERVAL_S: f64 = 10.0;
+const INTERVAL: Duration = Duration::from_secs(10);
+const SCAN_DELAY: Duration = Duration::from_millis(500);
+
+/// Whether progress is a bar: on a terminal, without `--quiet`.
+pub fn has_bar() -> bool {
+    stderr().is_terminal() && Verbosity::chosen() == Verbosity::Normal
+}
+
+/// Creates a bar before a message, which is cut at the end of the line: a wrapped bar would leave copies of itself behind.
+pub fn bar(total: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:8.cyan/dim} {wide_msg}").expect("a valid template");
+    ProgressBar::new(total).with_style(style)
+}
 
 /// A counter of finished items: a bar on a terminal, a line every ten seconds elsewhere.
 pub struct Counter {
@@ -24,28 +34,22 @@ pub struct Counter {
 
 impl Counter {
     pub fn new(name: &str, total: u64) -> Self {
-        let has_bar = std::io::stderr().is_terminal() && Verbosity::chosen() != Verbosity::Quiet;
-        let bar = has_bar.then(|| progress_bar(name, 0, total));
         let now = Instant::now();
-        Self { name: name.into(), total, bar, started: now, last_line: now }
+        Self { name: name.into(), total, bar: has_bar().then(|| bar(total)), started: now, last_line: now }
     }
 
     pub fn set(&mut self, done: u64) {
+        let line = || line(&self.name, done, self.total, self.started.elapsed().as_secs_f64());
         match &self.bar {
-            Some(bar) => bar.set_position(done),
-            None if self.last_line.elapsed().as_secs_f64() >= INTERVAL_S => {
+            Some(bar) => {
+                bar.set_message(line());
+                bar.set_position(done);
+            }
+            None if self.last_line.elapsed() >= INTERVAL => {
+                print_note(&line());
                 self.last_line = Instant::now();
-                let line = line(&self.name, done, self.total, self.started.elapsed().as_secs_f64());
-                print_note(&line);
             }
             None => {}
-        }
-    }
-
-    pub fn note(&self, line: &str) {
-        match &self.bar {
-            Some(bar) => bar.println(visible(line)),
-            None => print_note(line),
         }
     }
 }
@@ -58,40 +62,22 @@ impl Drop for Counter {
     }
 }
 
-/// A counter of the examined chunks of a data set, shown if the scan takes longer than half a second, as the first one does.
-#[derive(Default)]
-pub struct ScanCounter {
-    /// Start of the scan, and the counter once it is shown.
-    scan: Option<(Instant, Option<Counter>)>,
-}
-
-impl ScanCounter {
-    pub fn set(&mut self, done: usize, total: usize) {
-        let (started, shown) = self.scan.get_or_insert_with(|| (Instant::now(), None));
+/// Returns a counter of the examined chunks of data sets, shown when a scan takes longer than half a second.
+pub fn scan_counter() -> impl FnMut(usize, usize) {
+    let mut scan: Option<(Instant, Option<Counter>)> = None;
+    move |done, total| {
+        let (started, shown) = scan.get_or_insert_with(|| (Instant::now(), None));
         if started.elapsed() > SCAN_DELAY {
             shown.get_or_insert_with(|| Counter::new("chunks", total as u64)).set(done as u64);
         }
         if done == total {
-            self.scan = None;
+            scan = None;
         }
     }
 }
-
-const SCAN_DELAY: Duration = Duration::from_millis(500);
 
 fn line(name: &str, done: u64, total: u64, elapsed_s: f64) -> String {
     let per_s = done.max(1) as f64 / elapsed_s.max(1e-9);
     let left_s = total.saturating_sub(done) as f64 / per_s;
     format!("{name} {done}/{total}  {}, {} left", rate(per_s), duration(left_s))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn line_has_mean_rate_and_time_left() {
-        assert_eq!(line("train", 40, 100, 10.0), "train 40/100  4.0/s, 15 s left");
-        assert_eq!(line("train", 0, 100, 0.0), line("train", 0, 100, 1e-9));
-    }
 }

@@ -5,19 +5,13 @@
 //! - `output_file`: files that are written, checked beforehand
 //! - `tensorboard`: event files
 //! - `stdout`: results to stdout, notes to stderr
-//! - `event_line`: an event as one line
-//! - `plain`: progress lines for log files
-//! - `bar`: progress bar
 //! - `counter`: progress of counted work
 //! - `written_scene`: what `clift encode` wrote
-//! - `progress_sink`: bar, lines or nothing, by verbosity
+//! - `progress`: progress of a run
 
-pub(crate) mod bar;
 pub(crate) mod counter;
-pub(crate) mod event_line;
 pub(crate) mod output_file;
-pub(crate) mod plain;
-pub(crate) mod progress_sink;
+pub(crate) mod progress;
 pub(crate) mod stdout;
 pub(crate) mod tensorboard;
 pub(crate) mod units;

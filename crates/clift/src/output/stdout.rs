@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use clift_eval::Summary;
+use clift_model::{DeviceName, used_adapter};
 
 use crate::output::visible::visible;
 use crate::verbosity::Verbosity;
@@ -54,10 +55,26 @@ pub fn print_problem(text: &str) {
     drop(writeln!(std::io::stderr(), "{}", visible(text)));
 }
 
+/// Prints the adapter of `wgpu`; nothing for other devices. `compiles` says that the silence of the first step follows.
+pub fn name_adapter(device: DeviceName, compiles: bool) {
+    if device != DeviceName::Wgpu {
+        return;
+    }
+    let Some(adapter) = used_adapter() else { return };
+    print_note(&format!("wgpu: {adapter}"));
+    if adapter.kind == "software" {
+        print_warning("this adapter is software on the CPU: `--device flex` is many times faster");
+    }
+    if compiles {
+        print_note(&format!("compiling kernels for {}: the first step may take minutes", adapter.name));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// Fails when it is flushed.
     struct Fails(ErrorKind);
 
     impl Write for Fails {
@@ -76,9 +93,6 @@ mod tests {
         let error = write_result(Fails(ErrorKind::StorageFull), "row").unwrap_err();
         assert_eq!(format!("{error:#}"), "writing to the standard output: no storage space");
         let mut out = Vec::new();
-        write_result(&mut out, "row").unwrap();
-        assert_eq!(out, b"row\n");
-        out.clear();
         write_result(&mut out, "key\u{1b}[2J").unwrap();
         assert_eq!(out, b"key\\u{1b}[2J\n");
     }

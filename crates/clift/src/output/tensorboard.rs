@@ -6,13 +6,11 @@
 
 /// A value of a curve.
 pub struct Scalar<'a> {
-    /// Name of the curve.
     pub tag: &'a str,
     /// Step from 1.
     pub step: u64,
     /// Seconds since 1970.
     pub time: f64,
-    /// The value.
     pub value: f64,
 }
 

@@ -3,10 +3,9 @@
 use std::path::Path;
 
 use clift_data::plural;
-use clift_model::TokenKind;
 use clift_scene::{CheckedView, EncodedScene, MIN_CONTEXT_PSNR, WrittenScene};
 
-use crate::output::stdout::{print_note, print_result, print_warning};
+use crate::output::stdout::{print_result, print_warning};
 use crate::output::units::file_size;
 
 /// Most frames of a list.
@@ -17,10 +16,22 @@ const MAX_LISTED_CHECKS: usize = 16;
 /// Prints what was written, and how well its views come out. `model` is the name of the model; of a capture, warns of fog.
 pub fn print_scene(written: &WrittenScene, out: &Path, model: &str, is_capture: bool) -> anyhow::Result<()> {
     print_result(&describe(written, out))?;
-    if let (Some([width, height]), [w, h]) = (written.cropped, written.image_size) {
-        print_note(&format!("of images of {w} x {h}, the central {width} x {height} pixels are used"));
+    let psnrs: Vec<f64> = written.contexts.iter().map(|view| view.psnr).collect();
+    let psnr = clift_core::mean(&psnrs).unwrap_or_default();
+    print_result(&format!("check: the context views are rendered at {psnr:.2} dB"))?;
+    let fog = written.contexts.iter().filter(|view| view.is_fog());
+    let fog: Vec<String> = fog.map(|view| written.frame_name(view.frame)).collect();
+    if is_capture && !fog.is_empty() {
+        let more = if fog.len() > MAX_LISTED { ", .." } else { "" };
+        print_warning(format!(
+            "fog, below {MIN_CONTEXT_PSNR} dB or worse than the mean image, in {} of {} renderings of context views: {}{more}; \
+             their neighbours are too far away: take more photos in between, encode one part of the place with --near PHOTO, \
+             or train on the capture (configs/capture.toml)",
+            fog.len(),
+            psnrs.len(),
+            fog[..fog.len().min(MAX_LISTED)].join(", ")
+        ));
     }
-    print_contexts(written, is_capture)?;
     match written.others[..] {
         [] => Ok(()),
         [CheckedView { frame, psnr, baseline_psnr }] => {
@@ -56,31 +67,8 @@ pub fn print_scene(written: &WrittenScene, out: &Path, model: &str, is_capture: 
     }
 }
 
-/// Prints how well the context views come out; of a capture, warns of fog.
-fn print_contexts(written: &WrittenScene, is_capture: bool) -> anyhow::Result<()> {
-    let psnrs: Vec<f64> = written.contexts.iter().map(|view| view.psnr).collect();
-    let fog: Vec<String> =
-        written.contexts.iter().filter(|view| view.is_fog()).map(|view| written.frame_name(view.frame)).collect();
-    print_result(&format!(
-        "check: the context views are rendered at {:.2} dB",
-        clift_core::mean(&psnrs).unwrap_or_default()
-    ))?;
-    if is_capture && !fog.is_empty() {
-        let more = if fog.len() > MAX_LISTED { ", .." } else { "" };
-        print_warning(format!(
-            "fog, below {MIN_CONTEXT_PSNR} dB or worse than the mean image, in {} of {} renderings of context views: {}{more}; \
-             their neighbours are too far away: take more photos in between, encode one part of the place with --near PHOTO, \
-             or train on the capture (configs/capture.toml)",
-            fog.len(),
-            psnrs.len(),
-            fog[..fog.len().min(MAX_LISTED)].join(", ")
-        ));
-    }
-    Ok(())
-}
-
 fn describe(written: &WrittenScene, path: &Path) -> String {
-    let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = &written.encoded;
+    let EncodedScene { scene, num_lift_tokens, .. } = &written.encoded;
     let num_tokens = scene.num_tokens();
     let mut frames: Vec<String> =
         scene.context_frames.iter().map(|&frame| written.frame_name(frame as usize)).collect();
@@ -91,12 +79,8 @@ fn describe(written: &WrittenScene, path: &Path) -> String {
         1 => String::new(),
         count => format!(" in {count} groups"),
     };
-    let clusters = match scene.kind {
-        TokenKind::All => String::new(),
-        _ => format!("\ntokens  variance within clusters\n{num_tokens:>6}  {cluster_error:.4}"),
-    };
     format!(
-        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {}), {}\nscene {}, {}{groups} of {} x {}: frames {}{clusters}",
+        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {}), {}\nscene {}, {}{groups} of {} x {}: frames {}",
         path.display(),
         scene.kind,
         written.stored,

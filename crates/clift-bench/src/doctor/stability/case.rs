@@ -21,14 +21,12 @@ impl CaseSize {
     }
 }
 
-/// Devices of a case and of its f64 reference.
 #[derive(Clone, Debug)]
 pub struct CaseDevices {
     /// Device of the case, without autodiff.
     pub device: Device,
     /// Flex: its f64 uses the composed operations instead of the f32 kernels.
     pub reference: Device,
-    /// Size of the case.
     pub size: CaseSize,
 }
 

@@ -4,12 +4,10 @@
 //! - `attention`: long and extreme attention
 //! - `updates`: updates on extreme views
 //! - `clusters`: degenerate clusters
-//! - `training`: ten times the learning rate
 //! - `suite`: all cases, table
 
 pub(crate) mod attention;
 pub(crate) mod case;
 pub(crate) mod clusters;
 pub(crate) mod suite;
-pub(crate) mod training;
 pub(crate) mod updates;

@@ -7,10 +7,10 @@ use clift_model::DeviceName;
 use clift_train::TrainError;
 
 use crate::doctor::stability::case::{CaseDevices, CaseSize, StabilityCase, StabilityRow};
-use crate::doctor::stability::{attention, clusters, training, updates};
+use crate::doctor::stability::{attention, clusters, updates};
 
 /// All cases, in the order of the table.
-const CASES: [&[StabilityCase]; 4] = [updates::CASES, clusters::CASES, attention::CASES, training::CASES];
+const CASES: [&[StabilityCase]; 3] = [updates::CASES, clusters::CASES, attention::CASES];
 
 /// Runs every case on the devices and passes each finished row to `report`.
 pub fn run_stability(

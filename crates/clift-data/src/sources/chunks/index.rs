@@ -1,7 +1,7 @@
-//! The file of every scene in a folder of chunks: read from `index.json`, or determined from the files.
+//! The file of every scene in a folder of chunks or of one file per scene.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
 
 use rayon::prelude::*;
@@ -9,13 +9,11 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::{file_names, has_ending};
-use crate::skip_report::{SkipReport, first_few, note_on, plural};
-use crate::sources::chunks::table::ChunkTable;
-use crate::sources::test_scenes::TestScenes;
+use crate::skip_report::{SkipReport, first_few, plural};
+use crate::sources::chunks::table::{CHUNKS_PER_CALL, ChunkTable, ScanProgress};
 
-/// List of the authors' released code, beside one file per scene: keys of scenes whose images have another size.
-const INVALID_KEYS: &str = "invalid_keys.txt";
-
+/// Largest number of files that are tried for one that tells chunks from files of one scene.
+const MAX_TRIED_FILES: usize = 8;
 /// Largest size of an `index.json`; the one of `RealEstate10K` has 3 MB.
 const MAX_INDEX_BYTES: u64 = 1 << 30;
 
@@ -46,79 +44,45 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
     Ok((!files.is_empty()).then(note))
 }
 
-/// Returns the file of every scene without an index: by file name for one file per scene, by table for chunks.
-pub(crate) fn index_of_files(folder: &Path, report: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
+/// Returns the file of every scene of a folder without an index: by name for one file per scene, by contents for chunks.
+pub(crate) fn index_of_files(
+    folder: &Path,
+    report: &mut SkipReport,
+    progress: ScanProgress<'_>,
+) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
-    let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
-    let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&folder.join(file)).ok()?)));
-    if first.is_some_and(|(file, table)| table.scenes.len() != 1 || !table.scenes.contains_key(&stem(file))) {
-        return Ok(index_of_chunks(folder, &files, report));
+    let stem = |file: &String| file.strip_suffix(".torch").unwrap_or(file).to_owned();
+    let read = |file: &String| (file.clone(), ChunkTable::read(&folder.join(file)));
+    let first = files.iter().take(MAX_TRIED_FILES).map(read).find_map(|(file, table)| Some((stem(&file), table.ok()?)));
+    if first.is_none_or(|(key, table)| table.scenes.len() == 1 && table.scenes.contains_key(&key)) {
+        return Ok(files.into_iter().map(|file| (stem(&file), file)).collect());
     }
-    let mut index: BTreeMap<String, String> = files.iter().map(|file| (stem(file), file.clone())).collect();
-    let invalid = folder.join(INVALID_KEYS);
-    if invalid.is_file() {
-        let invalid = TestScenes::read(&invalid)?;
-        for key in index.keys().filter(|key| invalid.contains(key)) {
-            report.num_scenes += 1;
-            report.skip(key, format!("in {INVALID_KEYS}"));
-        }
-        index.retain(|key, _| !invalid.contains(key));
-    }
-    Ok(index)
-}
-
-fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> BTreeMap<String, String> {
-    let tables: Vec<_> = files.par_iter().map(|file| (file, ChunkTable::read(&folder.join(file)))).collect();
-    let mut index = BTreeMap::new();
-    let mut duplicates = Vec::new();
-    for (file, table) in tables {
-        match table {
-            Ok(table) => {
-                for key in table.scenes.into_keys() {
-                    match index.entry(key) {
-                        Entry::Vacant(entry) => {
-                            entry.insert(file.clone());
-                        }
-                        Entry::Occupied(first) => {
-                            duplicates.push(format!("{} in {} and {file}", first.key(), first.get()));
-                        }
-                    }
+    let (mut index, mut done) = (BTreeMap::new(), 0);
+    for part in files.chunks(CHUNKS_PER_CALL) {
+        let tables: Vec<_> = part.par_iter().map(read).collect();
+        for (file, table) in tables {
+            let mut skip = |key: &str, reason: &str| {
+                report.num_scenes += 1;
+                report.skip(key, reason);
+            };
+            let scenes = table.map(|table| table.scenes).inspect_err(|error| skip(&file, &error.to_string()));
+            for key in scenes.unwrap_or_default().into_keys().collect::<BTreeSet<_>>() {
+                match index.entry(key) {
+                    Entry::Vacant(entry) => _ = entry.insert(file.clone()),
+                    Entry::Occupied(first) => skip(first.key(), "also in an earlier file"),
                 }
             }
-            Err(error) => {
-                report.num_scenes += 1;
-                report.skip(file, error.to_string());
-            }
         }
+        done += part.len();
+        progress(done, files.len());
     }
-    duplicates.sort_unstable();
-    report.notes.extend(note_on(&duplicates, "in more than one file, the first of which is used"));
     let note = format!("no index.json: the scenes of {} files were determined from their contents", files.len());
     report.notes.push(note);
-    index
+    Ok(index)
 }
 
 fn torch_files(folder: &Path) -> Result<Vec<String>, DataError> {
     let mut files = file_names(folder)?;
     files.retain(|name| has_ending(name, "torch"));
     Ok(files)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes};
-
-    #[test]
-    fn keys_may_end_in_the_file_extension() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a.torch.torch");
-        let (key, url) = ("a.torch".to_owned(), String::new());
-        let scene = SceneRecord { key, url, timestamps: Vec::new(), cameras: Vec::new(), images: Vec::new() };
-        std::fs::write(&path, scene_file_bytes(&path, &scene).unwrap()).unwrap();
-        let mut report = SkipReport::default();
-        let index = index_of_files(folder.path(), &mut report).unwrap();
-        assert_eq!(index, BTreeMap::from([("a.torch".to_owned(), "a.torch.torch".to_owned())]));
-        assert!(report.notes.is_empty(), "not read as a chunk: {report}");
-    }
 }

@@ -1,4 +1,4 @@
-//! Byte ranges of the cameras, time stamps and frames of every scene in a chunk.
+//! Byte ranges of the cameras and frames of every scene in a chunk.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -6,11 +6,11 @@ use std::path::Path;
 use clift_core::{Camera, IntrinsicsNorm, widest_fov_deg};
 
 use crate::error::DataError;
+use crate::geometry::path_spread::far_cameras;
 use crate::geometry::scaled_rotation::camera_of_row;
-use crate::torch::archive::{Archive, ByteSpan};
+use crate::torch::archive::{Archive, ByteSpan, tensor_span};
 use crate::torch::pickle::Pickle;
-use crate::torch::tensor_span::tensor_span;
-use crate::torch::values::{ElementType, MAX_BYTES, MAX_VALUES, Value};
+use crate::torch::values::{ElementType, MAX_VALUES, Value};
 
 /// Largest number of frames of all scenes of a chunk. The size of the pickle does not bound it, because scenes may share
 /// a list of frames. Scenes without sharing have at least 8 values per frame, thus fewer frames than this.
@@ -19,19 +19,29 @@ const MAX_FRAMES: usize = MAX_VALUES / 8;
 /// Largest number of unusable frames of a scene; with more, the scene is unusable.
 const MAX_UNUSABLE: usize = 1000;
 
+/// Chunks that are examined between two calls of the progress callback.
+pub(crate) const CHUNKS_PER_CALL: usize = 64;
+
+/// Progress callback of a scan: numbers of examined chunks, and of all.
+pub type ScanProgress<'a> = &'a mut dyn FnMut(usize, usize);
+
+/// What is odd in a scene, for the notes of a report.
+pub(crate) const ODDITIES: [&str; 3] = [
+    "without time stamps as int64: frames count 0, 1, ..",
+    "with scaled rotations, whose scale was divided out",
+    "with cameras far from the others, which set the scale if they are contexts",
+];
+
 pub(crate) struct SceneTable {
     pub key: String,
-    pub url: String,
-    /// `None` for time stamps that are missing or not int64.
-    pub timestamps: Option<ByteSpan>,
     cameras: ByteSpan,
     camera_type: ElementType,
     /// Images of the usable frames.
     pub images: Vec<ByteSpan>,
     /// Frames of the file whose cameras cannot be used, in order, with the reasons.
     pub unusable: Vec<(usize, String)>,
-    /// Whether rotations had a uniform scale, which is divided out.
-    pub has_scale: bool,
+    /// Which of [`ODDITIES`] the scene has.
+    pub oddities: [bool; ODDITIES.len()],
     /// Largest field of view of the usable frames, in degrees; `None` for unreadable cameras.
     pub fov_deg: Option<f64>,
 }
@@ -55,8 +65,7 @@ impl ChunkTable {
             scene @ Value::Dict(_) => vec![scene],
             _ => return Err(bad("the outermost object is neither a list of scenes nor a scene".into())),
         };
-        let mut builder =
-            Builder { pickle: &pickle, archive: &archive, scenes: HashMap::new(), num_frames: 0, url_bytes: 0 };
+        let mut builder = Builder { pickle: &pickle, archive: &archive, scenes: HashMap::new(), num_frames: 0 };
         for (position, scene) in scenes.into_iter().enumerate() {
             builder.add(scene).map_err(|what| bad(format!("scene {position}: {what}")))?;
         }
@@ -75,7 +84,6 @@ struct Builder<'a> {
     archive: &'a Archive,
     scenes: HashMap<String, SceneTable>,
     num_frames: usize,
-    url_bytes: usize,
 }
 
 impl Builder<'_> {
@@ -86,14 +94,6 @@ impl Builder<'_> {
         let in_scene = |what: String| format!("key {key:?}: {what}");
         if self.scenes.contains_key(key) {
             return Err(in_scene("it occurs twice".into()));
-        }
-        let url = match pickle.item(scene, "url") {
-            Some(Value::Str(url)) => url.as_str(),
-            _ => "",
-        };
-        self.url_bytes += url.len();
-        if self.url_bytes > MAX_BYTES {
-            return Err(in_scene(format!("the `url`s so far have more than the limit of {MAX_BYTES} bytes")));
         }
         let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is not a list".into())) };
         self.num_frames += image_ids.len();
@@ -112,9 +112,9 @@ impl Builder<'_> {
         };
         let (cameras, camera_type) =
             tensor("cameras", &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64])?;
-        let timestamps = tensor("timestamps", &[Some(num_frames)], &[ElementType::I64]).ok().map(|(span, _)| span);
-        let (key, url, unusable, has_scale, fov_deg) = (key.clone(), url.to_owned(), Vec::new(), false, None);
-        let table = SceneTable { key, url, timestamps, cameras, camera_type, images, unusable, has_scale, fov_deg };
+        let oddities = [tensor("timestamps", &[Some(num_frames)], &[ElementType::I64]).is_err(), false, false];
+        let (key, unusable, fov_deg) = (key.clone(), Vec::new(), None);
+        let table = SceneTable { key, cameras, camera_type, images, unusable, oddities, fov_deg };
         self.scenes.insert(table.key.clone(), table);
         Ok(())
     }
@@ -128,7 +128,7 @@ impl SceneTable {
         for (frame, row) in rows.into_iter().enumerate() {
             match camera_of_row(row) {
                 Ok((camera, scale)) => {
-                    self.has_scale |= scale.is_some();
+                    self.oddities[1] |= scale.is_some();
                     cameras.push(camera);
                 }
                 Err(error) => self.unusable.push((frame, format!("whose camera cannot be used: {error}"))),
@@ -139,6 +139,8 @@ impl SceneTable {
                 return;
             }
         }
+        let centres: Vec<_> = cameras.iter().map(|camera| camera.c2w.translation).collect();
+        self.oddities[2] = !far_cameras(&centres).is_empty();
         self.fov_deg = Some(widest_fov_deg(&cameras));
         let images = std::mem::take(&mut self.images);
         self.images = self.usable(images);
@@ -173,10 +175,5 @@ impl SceneTable {
             })
         };
         self.usable(self.read_rows(path)?).iter().map(camera).collect()
-    }
-
-    pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
-        let Some(span) = self.timestamps else { return Ok((0..self.images.len() as i64).collect()) };
-        Ok(self.usable(span.read(path)?.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect()))
     }
 }

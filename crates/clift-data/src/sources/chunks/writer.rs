@@ -7,20 +7,13 @@ use clift_core::{Camera, IntrinsicsNorm, replace_file};
 
 use crate::error::DataError;
 use crate::torch::pickle_writer::PickleWriter;
-use crate::torch::values::{MAX_BYTES, MAX_VALUES};
-
-/// Number of frames at which a chunk is closed; readers accept 1,048,576 values, about 19 per frame.
-const MAX_CHUNK_FRAMES: usize = 50_000;
+use crate::torch::values::MAX_VALUES;
 
 /// One scene to write.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneRecord {
     /// Unique scene key.
     pub key: String,
-    /// URL of the scene; may be empty.
-    pub url: String,
-    /// One per frame: microseconds for RealEstate10K, frame numbers for DL3DV.
-    pub timestamps: Vec<i64>,
     /// One per frame.
     pub cameras: Vec<Camera<IntrinsicsNorm>>,
     /// One JPEG or PNG file per frame.
@@ -34,56 +27,24 @@ impl SceneRecord {
     }
 
     /// Checks that the lists have equal lengths, that there are frames, and that the scene fits into one file.
-    pub(crate) fn check(&self) -> Result<(), String> {
-        let Self { key, timestamps, cameras, images, .. } = self;
-        let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
-        if timestamps != images || cameras != images {
-            return Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"));
+    fn check(&self) -> Result<(), String> {
+        let Self { key, cameras, images } = self;
+        let (cameras, images) = (cameras.len(), images.len());
+        if cameras != images {
+            return Err(format!("scene {key} has {images} images, {cameras} cameras"));
         }
         if images == 0 {
             return Err(format!("scene {key} has no frames"));
         }
-        if ChunkFill::default().has_room(self) {
+        if self.num_values() < MAX_VALUES {
             return Ok(());
         }
         Err(format!("scene {key} has {images} frames, above the limit of a file (about 50,000)"))
     }
-}
 
-/// Sizes of the scenes in a file.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct ChunkFill {
-    image_bytes: u64,
-    num_frames: usize,
-    /// Upper bounds of the values and bytes of the pickle.
-    num_values: usize,
-    pickle_bytes: usize,
-}
-
-impl ChunkFill {
-    fn with(self, scene: &SceneRecord) -> Self {
-        let num_frames = scene.images.len();
-        // At most 19 values and 170 bytes per tensor: one tensor per frame, two and five names per scene.
-        Self {
-            image_bytes: self.image_bytes + scene.image_bytes(),
-            num_frames: self.num_frames + num_frames,
-            num_values: self.num_values + 20 * num_frames + 60,
-            pickle_bytes: self.pickle_bytes + 180 * num_frames + 600 + scene.url.len() + scene.key.len(),
-        }
-    }
-
-    pub fn add(&mut self, scene: &SceneRecord) {
-        *self = self.with(scene);
-    }
-
-    /// Returns whether readers accept the file with one more scene.
-    pub fn has_room(self, scene: &SceneRecord) -> bool {
-        let Self { num_values, pickle_bytes, .. } = self.with(scene);
-        num_values < MAX_VALUES && pickle_bytes < MAX_BYTES
-    }
-
-    pub fn is_full(self, target_bytes: u64) -> bool {
-        self.image_bytes >= target_bytes || self.num_frames >= MAX_CHUNK_FRAMES
+    /// Returns an upper bound of the values in a pickle: 19 per tensor, of which a scene has two and one per frame.
+    fn num_values(&self) -> usize {
+        20 * self.images.len() + 60
     }
 }
 
@@ -108,20 +69,22 @@ pub fn write_chunks(
     let mut index = BTreeMap::new();
     let mut num_chunks = 0;
     let mut pending = Vec::new();
-    let mut fill = ChunkFill::default();
+    let (mut image_bytes, mut num_values) = (0, 0);
     for scene in scenes {
         let scene = scene?;
         scene.check().map_err(&bad)?;
-        if !pending.is_empty() && (fill.is_full(target_bytes) || !fill.has_room(&scene)) {
+        let is_full = image_bytes >= target_bytes || num_values + scene.num_values() >= MAX_VALUES;
+        if is_full && !pending.is_empty() {
             write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
             num_chunks += 1;
             pending.clear();
-            fill = ChunkFill::default();
+            (image_bytes, num_values) = (0, 0);
         }
         if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
             return Err(bad(format!("scene {} occurs twice", scene.key)));
         }
-        fill.add(&scene);
+        image_bytes += scene.image_bytes();
+        num_values += scene.num_values();
         pending.push(scene);
     }
     if !pending.is_empty() {
@@ -132,7 +95,7 @@ pub fn write_chunks(
     Ok(index.len())
 }
 
-pub(crate) fn chunk_name(number: usize) -> String {
+fn chunk_name(number: usize) -> String {
     format!("{number:06}.torch")
 }
 
@@ -150,39 +113,23 @@ pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>
     pack(path, pickle)
 }
 
-/// Returns the bytes of the file at `path` with one scene, as in the authors' released code.
-pub(crate) fn scene_file_bytes(path: &Path, scene: &SceneRecord) -> Result<Vec<u8>, DataError> {
-    let mut pickle = PickleWriter::new();
-    write_scene(scene, &mut pickle);
-    pickle.raw(b".");
-    pack(path, pickle)
-}
-
 fn pack(path: &Path, pickle: PickleWriter) -> Result<Vec<u8>, DataError> {
     let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
     pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))
-}
-
-/// Returns time stamps in the format of a chunk: i64.
-fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
-    timestamps.iter().flat_map(|time| time.to_le_bytes()).collect()
-}
-
-/// Returns cameras in the format of a chunk: rows of 18 f32.
-fn camera_bytes(cameras: &[Camera<IntrinsicsNorm>]) -> Vec<u8> {
-    let rows = cameras.iter().flat_map(Camera::to_re10k);
-    rows.flat_map(|number| (number as f32).to_le_bytes()).collect()
 }
 
 fn write_scene(scene: &SceneRecord, pickle: &mut PickleWriter) {
     let num_frames = scene.images.len();
     pickle.raw(b"}(");
     pickle.string("url");
-    pickle.string(&scene.url);
+    pickle.string("");
     pickle.string("timestamps");
-    pickle.tensor("LongStorage", timestamp_bytes(&scene.timestamps), &[num_frames]);
+    let timestamps = (0..num_frames as i64).flat_map(i64::to_le_bytes).collect();
+    pickle.tensor("LongStorage", timestamps, &[num_frames]);
     pickle.string("cameras");
-    pickle.tensor("FloatStorage", camera_bytes(&scene.cameras), &[num_frames, 18]);
+    let rows = scene.cameras.iter().flat_map(Camera::to_re10k);
+    let rows = rows.flat_map(|number| (number as f32).to_le_bytes()).collect();
+    pickle.tensor("FloatStorage", rows, &[num_frames, 18]);
     pickle.string("images");
     pickle.raw(b"](");
     for image in &scene.images {
@@ -211,8 +158,6 @@ mod tests {
         };
         SceneRecord {
             key: key.into(),
-            url: format!("https://example.org/{key}"),
-            timestamps: (0..num_frames as i64).map(|frame| frame * 33_367 + (1 << 33)).collect(),
             cameras: (0..num_frames).map(camera).collect(),
             images: (0..num_frames).map(|frame| vec![frame as u8; 100 + frame % 50]).collect(),
         }
@@ -232,8 +177,6 @@ mod tests {
         assert_eq!(source.num_scenes(), 3);
         for record in &records {
             let scene = source.find(&record.key).unwrap();
-            assert_eq!(source.url(scene).unwrap(), record.url);
-            assert_eq!(source.timestamps(scene).unwrap(), record.timestamps);
             assert_eq!(source.num_frames(scene).unwrap(), record.images.len());
             for (frame, image) in record.images.iter().enumerate() {
                 assert_eq!(source.encoded_frame(scene, frame).unwrap().as_ref(), Some(image));
@@ -254,7 +197,7 @@ mod tests {
         write_chunks(&folder.path().join("test"), small.chain([record("long", most)]).map(Ok), u64::MAX).unwrap();
         let filters = SceneFilters { min_frames: 1, ..Default::default() };
         let source = ChunkSource::open(folder.path(), Split::Test, &filters).unwrap();
-        assert_eq!(source.report.to_string(), "20001 of 20001 scenes used");
+        assert_eq!(source.report.to_string(), "all 20001 scenes used");
         assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
         let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();
         assert!(message.to_string().contains(" frames, above the limit of a file (about 50,000)"), "{message}");
@@ -263,15 +206,13 @@ mod tests {
     #[test]
     fn invalid_scenes_and_existing_indices_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let mut uneven = record("a", 3);
-        uneven.timestamps.pop();
-        let message = write_chunks(folder.path(), [Ok(uneven)], 1).unwrap_err().to_string();
-        assert!(message.contains("scene a has 3 images, 3 cameras, 2 time stamps"), "{message}");
-        let message =
-            write_chunks(folder.path(), [Ok(record("a", 1)), Ok(record("a", 1))], 1000).unwrap_err().to_string();
-        assert!(message.contains("scene a occurs twice"), "{message}");
+        let message = |scenes: Vec<SceneRecord>| {
+            write_chunks(folder.path(), scenes.into_iter().map(Ok), 1000).unwrap_err().to_string()
+        };
+        let uneven = SceneRecord { cameras: Vec::new(), ..record("a", 3) };
+        assert!(message(vec![uneven]).contains("scene a has 3 images, 0 cameras"));
+        assert!(message(vec![record("a", 1), record("a", 1)]).contains("scene a occurs twice"));
         write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap();
-        let message = write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap_err().to_string();
-        assert!(message.contains("it holds an index.json; choose an empty folder"), "{message}");
+        assert!(message(vec![record("a", 1)]).contains("it holds an index.json; choose an empty folder"));
     }
 }

@@ -3,19 +3,15 @@
 //! - `photo`: an image file with its camera
 //! - `image_folder`: look-up of image files by name
 //! - `image_locator`: images named by a camera file, wherever they are
-//! - `loose_json`: JSON with words for NaN and lists of bounded length
 //! - `nerfstudio`: transforms.json (nerfstudio, DL3DV)
 //! - `re10k_text`: RealEstate10K camera text files
 //! - `scene_folder`: folders that hold one scene
-//! - `image_cache`: decoded and scaled photos on disk
 //! - `photo_source`: scenes of one file per frame
 //! - `colmap`: COLMAP models
 
 pub(crate) mod colmap;
-pub(crate) mod image_cache;
 pub(crate) mod image_folder;
 pub(crate) mod image_locator;
-pub(crate) mod loose_json;
 pub(crate) mod nerfstudio;
 pub(crate) mod photo;
 pub(crate) mod photo_source;

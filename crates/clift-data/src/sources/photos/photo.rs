@@ -1,6 +1,5 @@
 //! An image file with its camera, and a scene of such photos, in any layout with one file per frame.
 
-use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -19,6 +18,7 @@ use crate::image::codec::{
 use crate::image::jpeg_scan::check_image;
 use crate::image::lanczos::resize_lanczos;
 use crate::image::undistort::Undistortion;
+use crate::sources::filters::SceneFilters;
 
 pub(crate) const MAX_FRAMES: usize = 100_000;
 /// Largest size of an image file, in bytes.
@@ -45,19 +45,18 @@ pub(crate) struct PhotoOptions {
     pub first_folders: &'static [&'static str],
     /// Whether images are undistorted; otherwise lens distortion is ignored.
     pub undistort: bool,
-    /// Smallest columns and rows of the images of a default folder.
+    /// Smallest columns and rows of an image.
     pub min_size: [usize; 2],
     /// Colour of masked and transparent pixels.
     pub background: [u8; 3],
     /// Pixels from which poses were computed where the cameras fit both.
     pub poses_from: PosesFrom,
-}
-
-impl PhotoOptions {
-    /// Returns columns and rows of the pixels from which the poses of an image were computed.
-    pub fn size_of_poses(&self, [width, height]: [usize; 2], tag: Orientation) -> [usize; 2] {
-        if self.poses_from == PosesFrom::Turned && exchanges(tag) { [height, width] } else { [width, height] }
-    }
+    /// Filters of the scenes.
+    pub filters: SceneFilters,
+    /// Whether scenes with an unusable frame are skipped: published evaluation indices refer to complete scenes.
+    pub whole_scenes: bool,
+    /// Whether large photos stay in memory, scaled to cover `min_size`.
+    pub caches_photos: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -71,8 +70,6 @@ pub(crate) struct Photo {
     pub shape: Option<f64>,
     /// Mask of the image: pixels of 0 are left out.
     pub mask: Option<PathBuf>,
-    /// Time stamp in microseconds, or the number at the end of the file name.
-    pub time: Option<i64>,
     /// Whether the frame is held out of training; `None` if the camera file does not say.
     pub is_held_out: Option<bool>,
     /// Orientation by which the undistorted image is turned, as `camera` was.
@@ -81,14 +78,8 @@ pub(crate) struct Photo {
     pub poses_from: PosesFrom,
 }
 
-/// Header of a photo.
-pub(crate) struct PhotoHeader {
-    /// Columns and rows of the turned image.
-    pub size: [usize; 2],
-    pub turn: Turn,
-}
-
-/// How the EXIF orientation of a photo is used. Some tools compute cameras from stored pixels, others turn them first.
+/// How the EXIF orientation of a photo is used. Some tools turn photos before they compute cameras; others, such as COLMAP,
+/// take the stored pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Turn {
     /// Turns the pixels alone, to those of the camera.
@@ -97,14 +88,11 @@ pub(crate) struct Turn {
     pub view: Orientation,
     /// Whether the cameras fit the stored and the turned pixels.
     pub is_undecided: bool,
-    /// Whether the orientation is not used: a camera cannot mirror.
-    pub is_unused: bool,
 }
 
 impl Turn {
-    pub fn is_any(self) -> bool {
-        self.pixels != Orientation::NoTransforms || self.view != Orientation::NoTransforms
-    }
+    pub const NONE: Self =
+        Self { pixels: Orientation::NoTransforms, view: Orientation::NoTransforms, is_undecided: false };
 }
 
 /// [`MissingPhoto::reason`] of a file that does not exist.
@@ -127,12 +115,8 @@ pub(crate) struct MissingPhoto {
 pub(crate) struct PhotoScene {
     pub photos: Vec<Photo>,
     pub missing: Vec<MissingPhoto>,
-    /// Number of images without a camera.
-    pub num_without_camera: usize,
     /// Notes for the skip report.
     pub notes: Vec<String>,
-    /// URL of the scene; empty if unknown.
-    pub url: String,
 }
 
 impl Photo {
@@ -152,7 +136,7 @@ impl Photo {
             return Err(DataError::bad_camera(what.into()));
         }
         let mut photo = Self::pinhole(path, Camera { intrinsics: intrinsics_norm, c2w });
-        (photo.time, photo.shape) = (number_at_end(&photo.path), size.map(|[width, height]| width / height));
+        photo.shape = size.map(|[width, height]| width / height);
         if undistort && !lens.is_pinhole() {
             let undistortion = Undistortion::new(intrinsics_norm, lens)?;
             photo.camera.intrinsics = undistortion.intrinsics_norm();
@@ -164,41 +148,39 @@ impl Photo {
     /// Creates a photo of a pinhole camera.
     pub fn pinhole(path: PathBuf, camera: Camera<IntrinsicsNorm>) -> Self {
         let (view_turn, poses_from) = (Orientation::NoTransforms, PosesFrom::default());
-        Self {
-            path,
-            camera,
-            undistortion: None,
-            shape: None,
-            mask: None,
-            time: None,
-            is_held_out: None,
-            view_turn,
-            poses_from,
-        }
+        Self { path, camera, undistortion: None, shape: None, mask: None, is_held_out: None, view_turn, poses_from }
     }
 
     pub fn read(&self) -> Result<Vec<u8>, DataError> {
         read_bounded(&self.path, MAX_IMAGE_BYTES, "reading an image")
     }
 
-    /// Reads header and end of the image file, and the header of its mask, and checks the aspect ratios.
-    pub fn header(&self) -> Result<PhotoHeader, DataError> {
+    /// Reads header and end of the image file, and the header of its mask, and checks the aspect ratios. Returns columns and rows
+    /// of the turned image.
+    pub fn header(&self) -> Result<([usize; 2], Turn), DataError> {
         let (stored, tag) = read_header(&self.path)?;
         let turn = self.turn(stored, tag)?;
         check_end(&self.path, MAX_IMAGE_BYTES)?;
         if let Some(path) = &self.mask {
-            let bad = |what: String| DataError::BadMask { what, path: path.clone() };
+            let reason = "whose mask cannot be used";
+            let bad =
+                |what: String| DataError::BadPhoto { reason, what: format!("bad mask: {what}"), path: path.clone() };
             let (size, _) = read_header(path).map_err(|error| bad(error.to_string()))?;
             check_mask_size(size, stored).map_err(bad)?;
         }
         let [width, height] = stored;
         let size = if exchanges(turn.pixels) || exchanges(turn.view) { [height, width] } else { stored };
-        Ok(PhotoHeader { size, turn })
+        Ok((size, turn))
     }
 
     /// Checks the data of the file.
     pub fn check_data(&self) -> Result<(), DataError> {
-        check_image(&self.read()?).map_err(|what| DataError::DamagedImage { what, path: self.path.clone() })
+        let damaged = |what: String| DataError::BadPhoto {
+            reason: "whose image is damaged",
+            what: format!("the image is damaged: {what}"),
+            path: self.path.clone(),
+        };
+        check_image(&self.read()?).map_err(damaged)
     }
 
     /// Returns whether a mask or an alpha channel leaves pixels out.
@@ -217,9 +199,7 @@ impl Photo {
         let bytes = self.read()?;
         let (mut image, alpha) = decode_with_alpha(&bytes, key, frame)?;
         let stored = [image.width, image.height];
-        let is_plain = self.poses_from == PosesFrom::Stored && self.fits(stored);
-        let pixels =
-            if is_plain { Orientation::NoTransforms } else { self.turn(stored, exif_orientation(&bytes))?.pixels };
+        let pixels = self.turn(stored, exif_orientation(&bytes))?.pixels;
         let mask = self.mask.as_ref().map(|mask| read_mask(mask, &image, key, frame)).transpose()?;
         let coverage = match (alpha, mask) {
             (Some(alpha), Some(mask)) => Some(alpha.iter().zip(mask).map(|(alpha, mask)| alpha & mask).collect()),
@@ -268,22 +248,25 @@ impl Photo {
     /// Decides how the EXIF orientation `tag` is used, by the aspect ratio of the camera.
     fn turn(&self, stored: [usize; 2], tag: Orientation) -> Result<Turn, DataError> {
         let [width, height] = stored;
-        let is_tagged = tag != Orientation::NoTransforms;
-        let (fits_stored, fits_turned) =
-            (self.fits(stored), is_tagged && self.fits(if exchanges(tag) { [height, width] } else { stored }));
-        if !fits_stored && !fits_turned {
-            let camera_aspect = self.shape.unwrap_or_default();
-            return Err(DataError::WrongAspect { width, height, camera_aspect, path: self.path.clone() });
-        }
-        let turns_pixels = fits_turned && (!fits_stored || self.poses_from == PosesFrom::Turned);
         let is_rotation = matches!(tag, Orientation::Rotate90 | Orientation::Rotate180 | Orientation::Rotate270);
-        let none = Orientation::NoTransforms;
-        Ok(Turn {
-            pixels: if turns_pixels { tag } else { none },
-            view: if !turns_pixels && is_rotation { tag } else { none },
-            is_undecided: fits_stored && fits_turned && is_rotation,
-            is_unused: is_tagged && !turns_pixels && !is_rotation,
-        })
+        let fits_turned = self.fits(if exchanges(tag) { [height, width] } else { stored });
+        match (self.fits(stored), fits_turned) {
+            (true, true) if self.poses_from == PosesFrom::Turned => {
+                return Ok(Turn { pixels: tag, is_undecided: is_rotation, ..Turn::NONE });
+            }
+            (true, _) if is_rotation => return Ok(Turn { view: tag, is_undecided: fits_turned, ..Turn::NONE }),
+            (true, _) => return Ok(Turn::NONE),
+            (false, true) => return Ok(Turn { pixels: tag, ..Turn::NONE }),
+            (false, false) => {}
+        }
+        let what = format!(
+            "the image is {width}x{height}, aspect ratio {:.3}, but its camera has {:.3}; the image may have been rotated or \
+             cropped after the calibration",
+            width as f64 / height as f64,
+            self.shape.unwrap_or_default()
+        );
+        let reason = "whose image has another aspect ratio than its camera";
+        Err(DataError::BadPhoto { reason, what, path: self.path.clone() })
     }
 }
 
@@ -326,33 +309,20 @@ fn blend(pixel: [u8; 3], background: [u8; 3], share: u8) -> [u8; 3] {
     })
 }
 
-/// Returns the number at the end of a file name: 12 for `frame_00012.png`.
-fn number_at_end(path: &Path) -> Option<i64> {
-    let stem = path.file_stem()?.to_str()?;
-    let start = stem.rfind(|c: char| !c.is_ascii_digit()).map_or(0, |last| last + 1);
-    stem.get(start..)?.parse().ok()
-}
-
 impl PhotoScene {
     /// Gives each photo without a mask the file of its name in the folder `masks` (`masks_4` for images of `images_4`),
     /// with or without the ending of the image: `masks/a.jpg.png` (COLMAP) or `masks/a.png`.
     pub fn find_masks(&mut self, folder: &Path) {
-        let mut is_folder: HashMap<PathBuf, bool> = HashMap::new();
-        for photo in self.photos.iter_mut().filter(|photo| photo.mask.is_none()) {
+        let mut folders: Vec<PathBuf> =
+            ["", "_2", "_4", "_8"].map(|scaled| folder.join(format!("masks{scaled}"))).into();
+        folders.retain(|masks| masks.is_dir());
+        for photo in self.photos.iter_mut().filter(|photo| photo.mask.is_none() && !folders.is_empty()) {
             let Ok(below) = photo.path.strip_prefix(folder) else { continue };
-            let mut parts = below.components();
-            let first = parts.next().map(|part| part.as_os_str().to_string_lossy().into_owned()).unwrap_or_default();
-            let (scaled, below) = match parts.as_path() {
-                rest if rest.as_os_str().is_empty() => (String::new(), below),
-                rest => (first.strip_prefix("images").map(ToOwned::to_owned).unwrap_or_default(), rest),
-            };
-            let candidates = [format!("masks{scaled}"), "masks".into()].map(|name| folder.join(name));
-            let Some(masks) =
-                candidates.into_iter().find(|masks| *is_folder.entry(masks.clone()).or_insert_with(|| masks.is_dir()))
-            else {
-                continue;
-            };
-            let beside = masks.join(below);
+            let first = below.iter().next().unwrap_or_default().to_string_lossy();
+            let scaled = folder.join(first.replacen("images", "masks", 1));
+            let below = if below.iter().count() > 1 { below.strip_prefix(&*first).unwrap_or(below) } else { below };
+            let masks = folders.iter().find(|masks| **masks == scaled).or_else(|| folders.first());
+            let beside = masks.unwrap_or(&scaled).join(below);
             let mut with_ending = beside.clone().into_os_string();
             with_ending.push(".png");
             let mut files = [PathBuf::from(with_ending), beside.with_extension("png"), beside].into_iter();
@@ -374,16 +344,8 @@ impl PhotoScene {
         }
         let name = |photo: &Photo| {
             let below = photo.path.strip_prefix(common).unwrap_or(&photo.path);
-            let parts: Vec<_> = below.iter().map(|part| decode_name(part.as_encoded_bytes())).collect();
-            parts.join("/")
+            below.iter().map(|part| decode_name(part.as_encoded_bytes())).collect::<Vec<_>>().join("/")
         };
         self.photos.iter().map(name).collect()
-    }
-
-    /// Returns time stamps that increase from frame to frame; frame indices if the names have none.
-    pub fn timestamps(&self) -> Vec<i64> {
-        let times: Option<Vec<i64>> = self.photos.iter().map(|photo| photo.time).collect();
-        let times = times.filter(|times| times.is_sorted_by(|a, b| a < b));
-        times.unwrap_or_else(|| (0..self.photos.len() as i64).collect())
     }
 }

@@ -1,7 +1,7 @@
 //! Scenes with one image file per frame: RealEstate10K, DL3DV, own captures.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use clift_core::{Camera, DVec3, IntrinsicsNorm, RgbImage, widest_fov_deg};
 use image::metadata::Orientation;
@@ -10,59 +10,52 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::geometry::path_spread::far_cameras;
 use crate::image::codec::has_alpha;
+use crate::image::fit::covering_size;
+use crate::image::lanczos::resize_lanczos;
 use crate::scene_source::{SceneSource, is_held_out};
 use crate::skip_report::{SkipReport, first_few, plural};
-use crate::sources::filters::SceneFilters;
 use crate::sources::keys::find_by_name;
-use crate::sources::photos::image_cache::{ImageCache, ImageCacheConfig};
-use crate::sources::photos::photo::{MissingPhoto, NO_IMAGE, Photo, PhotoHeader, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{MissingPhoto, NO_IMAGE, Photo, PhotoOptions, PhotoScene, Turn};
 use crate::sources::photos::scene_folder::SceneFolder;
 
 /// Largest number of photos in the cache, about 300 bytes each.
 const MAX_CACHED_PHOTOS: usize = 200_000;
 const MAX_CACHED_SCENES: usize = 256;
-/// Largest number of frames named in the report; further frames are counted.
+/// Largest number of frames of a scene named in the report.
 const MAX_NAMED_FRAMES: usize = 10_000;
 
 const FAR: &str = "whose camera is farther away than 20 times the median step or distance";
 
 /// Images that a note counts.
-const COUNTED: [&str; 8] = [
-    "without a camera, not used",
+const COUNTED: [&str; 6] = [
     "turned by the EXIF orientation, as the size of the cameras requires",
     "turned with their cameras by the EXIF orientation",
     "with an EXIF orientation that fits the cameras both ways; data.files.poses_from names the pixels of the poses",
-    "with an EXIF orientation that is not applied, as it mirrors",
     "cut to the part of the lens that a pinhole camera can show, at most 120 degrees",
     "with a mask, whose black pixels get the colour data.background and do not count in loss and metrics",
     "with an alpha channel, whose transparent pixels get the colour data.background and do not count",
 ];
 
+/// Largest size of the decoded photos in memory, in bytes.
+const MAX_DECODED_BYTES: usize = 1 << 30;
+/// Smallest size of such a photo in pixels, and over those of the scaled image: others are decoded in a few milliseconds.
+const MIN_DECODED_PIXELS: usize = 640 * 480;
+const MIN_DECODED_RATIO: usize = 4;
+
 /// Largest number of scenes, and of bytes of the images of a scene, whose JPEG files are read to find damage.
 const MAX_CHECKED_SCENES: usize = 16;
 const MAX_CHECKED_BYTES: u64 = 512 << 20;
 
-#[derive(Clone, Debug, Default)]
-pub(crate) struct PhotoSourceOptions {
-    pub photos: PhotoOptions,
-    pub filters: SceneFilters,
-    /// Whether scenes with an unusable frame are skipped: published evaluation indices refer to complete scenes.
-    pub whole_scenes: bool,
-    /// Smallest columns and rows of an image.
-    pub min_size: [usize; 2],
-    /// Cache of large photos, scaled to cover `min_size`.
-    pub image_cache: Option<ImageCacheConfig>,
-}
-
-/// Scenes of photos, sorted by key. Cameras are read on use, and cached for the scenes used last.
+/// Scenes of photos, sorted by key. Cameras are read on use, and kept for the scenes used lately.
 pub(crate) struct PhotoSource {
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
     options: PhotoOptions,
     pub report: SkipReport,
-    image_cache: Option<ImageCache>,
-    /// Scenes used last, with their indices; the latest at the end.
-    cache: Mutex<Vec<(usize, Arc<PhotoScene>)>>,
+    /// Decoded photos by scene and frame, scaled to cover the smallest size, if the options ask for them.
+    decoded: Mutex<HashMap<(usize, usize), RgbImage>>,
+    /// Scenes used lately.
+    cache: Mutex<HashMap<usize, Arc<PhotoScene>>>,
 }
 
 struct Entry {
@@ -77,37 +70,36 @@ struct Entry {
 }
 
 /// Result of examining a scene at opening.
-#[derive(Default)]
 struct Findings {
-    num_frames: usize,
-    unusable: Vec<usize>,
-    turns: Vec<(usize, Orientation)>,
+    entry: Entry,
     missing: Vec<MissingPhoto>,
     /// Numbers of images, as in [`COUNTED`].
     counts: [usize; COUNTED.len()],
     notes: Vec<String>,
     /// Reason of skipping the scene, with the error to return if all scenes fail.
     reason: Option<(String, Option<DataError>)>,
-    /// Whether the data of all images was checked.
-    is_checked: bool,
 }
 
 impl PhotoSource {
     /// Reads the cameras of every scene in parallel and locates their images. Header and end of every image are checked;
     /// with `whole_scenes`, only of the first image of a scene.
-    pub fn open(folders: Vec<SceneFolder>, options: &PhotoSourceOptions) -> Result<Self, DataError> {
+    pub fn open(folders: Vec<SceneFolder>, options: &PhotoOptions) -> Result<Self, DataError> {
         options.filters.validate()?;
         let checks_data = !options.whole_scenes && folders.len() <= MAX_CHECKED_SCENES;
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options, checks_data)).collect();
         let mut report = SkipReport::new(folders.len());
-        let (mut scenes, mut first_error, mut num_unnamed) = (Vec::new(), None, 0);
+        let (mut scenes, mut first_error) = (Vec::new(), None);
         let mut counted: [(usize, Vec<String>); COUNTED.len()] = Default::default();
         for (folder, findings) in folders.into_iter().zip(findings) {
-            let failed =
-                |error: DataError| Findings { reason: Some((error.to_string(), Some(error))), ..Findings::default() };
-            let findings = findings.unwrap_or_else(failed);
-            let Findings { num_frames, unusable, turns, missing, counts, notes, reason, is_checked } = findings;
-            let has_photos = num_frames > 0;
+            let Findings { entry, missing, counts, notes, reason } = match findings {
+                Ok(findings) => findings,
+                Err(error) => {
+                    report.skip(folder.key, error.to_string());
+                    first_error.get_or_insert(error);
+                    continue;
+                }
+            };
+            let has_photos = entry.num_frames > 0;
             if let Some((reason, error)) = reason {
                 report.skip(&folder.key, reason);
                 first_error = first_error.or(error);
@@ -117,19 +109,12 @@ impl PhotoSource {
                     *total += count;
                     scenes.extend((count > 0).then(|| format!("{count} of {}", folder.key)));
                 }
-                scenes.push(Entry { folder: folder.clone(), num_frames, unusable, turns, is_checked });
+                scenes.push(entry);
             }
             // Without any image, the reason of the scene covers all frames.
             for MissingPhoto { name, reason } in missing.into_iter().filter(|_| has_photos) {
-                if report.frames.len() < MAX_NAMED_FRAMES {
-                    report.skip_frame(&folder.key, name, reason);
-                } else {
-                    num_unnamed += 1;
-                }
+                report.skip_frame(&folder.key, name, reason);
             }
-        }
-        if num_unnamed > 0 {
-            report.notes.push(format!("{num_unnamed} more frames skipped"));
         }
         for (what, (total, scenes)) in COUNTED.iter().zip(counted).filter(|(_, (total, _))| *total > 0) {
             report.notes.push(format!("{} {what}: {}", plural(total, "image"), first_few(&scenes)));
@@ -138,8 +123,8 @@ impl PhotoSource {
             return Err(error);
         }
         let positions = scenes.iter().enumerate().map(|(i, scene)| (scene.folder.key.clone(), i)).collect();
-        let image_cache = options.image_cache.as_ref().and_then(|config| ImageCache::open(config, options.min_size));
-        Ok(Self { scenes, positions, options: options.photos.clone(), report, image_cache, cache: Mutex::default() })
+        let (options, decoded, cache) = (options.clone(), Mutex::default(), Mutex::default());
+        Ok(Self { scenes, positions, options, report, decoded, cache })
     }
 
     fn entry(&self, scene: usize) -> Result<&Entry, DataError> {
@@ -148,15 +133,9 @@ impl PhotoSource {
 
     fn scene(&self, scene: usize) -> Result<Arc<PhotoScene>, DataError> {
         let entry = self.entry(scene)?;
-        let lock = || self.cache.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        {
-            let mut cache = lock();
-            if let Some(position) = cache.iter().position(|(other, _)| *other == scene) {
-                let found = cache.remove(position);
-                let photos = found.1.clone();
-                cache.push(found);
-                return Ok(photos);
-            }
+        let lock = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = lock().get(&scene) {
+            return Ok(found.clone());
         }
         let mut read = entry.folder.read(&self.options)?;
         for (position, orientation) in &entry.turns {
@@ -172,11 +151,12 @@ impl PhotoSource {
         }
         let read = Arc::new(read);
         let mut cache = lock();
-        cache.push((scene, read.clone()));
-        let mut num_photos: usize = cache.iter().map(|(_, scene)| scene.photos.len()).sum();
-        while cache.len() > 1 && (cache.len() > MAX_CACHED_SCENES || num_photos > MAX_CACHED_PHOTOS) {
-            num_photos -= cache.remove(0).1.photos.len();
+        if cache.len() == MAX_CACHED_SCENES
+            || cache.values().map(|scene| scene.photos.len()).sum::<usize>() > MAX_CACHED_PHOTOS
+        {
+            cache.clear();
         }
+        cache.insert(scene, read.clone());
         Ok(read)
     }
 
@@ -190,14 +170,13 @@ impl PhotoSource {
     }
 }
 
-fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool) -> Result<Findings, DataError> {
-    let scene = folder.read(&options.photos)?;
+fn examine(folder: &SceneFolder, options: &PhotoOptions, checks_data: bool) -> Result<Findings, DataError> {
+    let scene = folder.read(options)?;
     let names = scene.names();
-    let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = scene;
+    let PhotoScene { photos, mut missing, notes, .. } = scene;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
     let (mut turns, mut counts) = (Vec::new(), [0; COUNTED.len()]);
-    counts[0] = num_without_camera;
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
     let num_bytes = |photo: &Photo| std::fs::metadata(&photo.path).map_or(0, |metadata| metadata.len());
     let checks_data = checks_data && photos.iter().map(num_bytes).sum::<u64>() <= MAX_CHECKED_BYTES;
@@ -208,26 +187,19 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     let headers: Vec<_> = photos.par_iter().take(num_checked).map(check).collect();
     for (position, header) in headers.into_iter().enumerate() {
         match header {
-            Ok(PhotoHeader { size: [width, height], turn }) => {
+            Ok(([width, height], turn)) => {
                 is_small |= width < options.min_size[0] || height < options.min_size[1];
-                let turns_view = turn.view != Orientation::NoTransforms;
-                let turns_pixels = turn.pixels != Orientation::NoTransforms;
-                turns.extend(turns_view.then_some((position, turn.view)));
-                let is_counted =
-                    [turns_pixels && !turn.is_undecided, turns_view && !turn.is_undecided, turn.is_undecided];
-                let is_counted = is_counted.into_iter().chain([turn.is_unused]);
-                counts[1..=4]
-                    .iter_mut()
-                    .zip(is_counted)
-                    .for_each(|(count, is_counted)| *count += usize::from(is_counted));
-                counts[7] += usize::from(has_alpha(&photos[position].path));
+                let is_turned = [turn.pixels, turn.view].map(|turn| turn != Orientation::NoTransforms);
+                turns.extend(is_turned[1].then_some((position, turn.view)));
+                for (count, is_turned) in counts.iter_mut().zip(is_turned) {
+                    *count += usize::from(is_turned && !turn.is_undecided);
+                }
+                counts[2] += usize::from(turn.is_undecided);
+                counts[5] += usize::from(has_alpha(&photos[position].path));
             }
             Err(error) => {
                 let reason = match &error {
-                    DataError::WrongAspect { .. } => "whose image has another aspect ratio than its camera",
-                    DataError::TruncatedImage { .. } => "whose image is truncated",
-                    DataError::DamagedImage { .. } => "whose image is damaged",
-                    DataError::BadMask { .. } => "whose mask cannot be used",
+                    DataError::BadPhoto { reason, .. } => reason,
                     _ => "whose image cannot be read",
                 };
                 missing.push(MissingPhoto { name: names[position].clone(), reason: reason.into() });
@@ -280,10 +252,11 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions, checks_data: bool
     };
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
-    counts[5] = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
+    counts[3] = photos.iter().filter(|photo| photo.undistortion.as_ref().is_some_and(|lens| lens.is_cut())).count();
     let is_masked = |(position, photo): &(usize, &Photo)| photo.mask.is_some() && !unusable.contains(position);
-    counts[6] = photos.iter().enumerate().filter(is_masked).count();
-    Ok(Findings { num_frames, unusable, turns, missing, counts, notes, reason, is_checked: checks_data })
+    counts[4] = photos.iter().enumerate().filter(is_masked).count();
+    let entry = Entry { folder: folder.clone(), num_frames, unusable, turns, is_checked: checks_data };
+    Ok(Findings { entry, missing, counts, notes, reason })
 }
 
 impl SceneSource for PhotoSource {
@@ -308,14 +281,6 @@ impl SceneSource for PhotoSource {
         Ok(self.scene(scene)?.photos.iter().map(|photo| photo.camera).collect())
     }
 
-    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        Ok(self.scene(scene)?.timestamps())
-    }
-
-    fn url(&self, scene: usize) -> Result<String, DataError> {
-        Ok(self.scene(scene)?.url.clone())
-    }
-
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         Ok(self.frame_with_coverage(scene, frame)?.0)
     }
@@ -323,10 +288,26 @@ impl SceneSource for PhotoSource {
     fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
         let photo = self.photo(scene, frame)?;
         let decode = || photo.decode(self.options.background, self.key(scene), frame);
-        match &self.image_cache {
-            Some(cache) if !photo.has_coverage() => Ok((cache.scaled(&photo, || Ok(decode()?.0))?, None)),
-            _ => decode(),
+        let lock = || self.decoded.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(image) = lock().get(&(scene, frame)) {
+            return Ok((image.clone(), None));
         }
+        if !self.options.caches_photos || photo.has_coverage() {
+            return decode();
+        }
+        let (image, _) = decode()?;
+        let [width, height] = self.options.min_size;
+        let (width, height) = covering_size((image.width, image.height), (width, height));
+        let num_pixels = image.width * image.height;
+        if num_pixels < MIN_DECODED_PIXELS || num_pixels < MIN_DECODED_RATIO * width * height || width * height == 0 {
+            return Ok((image, None));
+        }
+        let image = resize_lanczos(&image, width, height);
+        let mut decoded = lock();
+        if (decoded.len() + 1) * image.rgb.len() <= MAX_DECODED_BYTES {
+            decoded.insert((scene, frame), image.clone());
+        }
+        Ok((image, None))
     }
 
     fn check_frame(&self, scene: usize, frame: usize) -> Result<(), DataError> {
@@ -335,14 +316,14 @@ impl SceneSource for PhotoSource {
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
-        if photo.undistortion.is_some() || photo.has_coverage() || photo.header()?.turn.is_any() {
+        if photo.undistortion.is_some() || photo.has_coverage() || photo.header()?.1 != Turn::NONE {
             return Ok(None);
         }
         photo.read().map(Some)
     }
 
     fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
-        Ok(self.photo(scene, frame)?.header()?.size)
+        Ok(self.photo(scene, frame)?.header()?.0)
     }
 
     fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {

@@ -1,17 +1,17 @@
 //! RealEstate10K as published: one text file of cameras per clip; the frames are extracted by the user.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
 use crate::files::bounded::{read_bounded, read_start};
 use crate::geometry::scaled_rotation::{ScaledCamera, camera_of_row, note_on_scales};
 use crate::skip_report::plural;
-use crate::sources::photos::image_folder::{images_in, numbered_images};
+use crate::sources::photos::image_folder::images_in;
 use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene, unusable};
 
 /// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
-const MAX_URL_CHARS: usize = 1000;
 /// Number of columns of a line: a time stamp, four intrinsics, two zeros and a pose of 3 x 4.
 const NUM_COLUMNS: usize = 19;
 
@@ -22,30 +22,28 @@ pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, 
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
     let text = String::from_utf8(text).map_err(|_| bad("the file is not UTF-8".into()))?;
-    let (url, lines) = parse(text.trim_start_matches('\u{feff}')).map_err(bad)?;
+    let lines = parse(text.trim_start_matches('\u{feff}')).map_err(bad)?;
     let times: Vec<i64> = lines.iter().map(|(time, _)| *time).collect();
     let (found, note) = locate(&times, &images);
-    let mut scene = PhotoScene { url, ..PhotoScene::default() };
+    let mut scene = PhotoScene::default();
     scene.notes.extend(note.map(|note| format!("frames of {}: {note}", path.display())));
     let scales = lines.iter().filter_map(|(_, camera)| camera.as_ref().ok()?.1);
     scene.notes.extend(note_on_scales(scales, path));
     for ((time, camera), image) in lines.into_iter().zip(found) {
         match (image, camera) {
-            (Some(path), Ok((camera, _))) => {
-                scene.photos.push(Photo { time: Some(time), ..Photo::pinhole(path.clone(), camera) });
-            }
+            (Some(path), Ok((camera, _))) => scene.photos.push(Photo::pinhole(path.clone(), camera)),
             (Some(_), Err(what)) => scene.skip(time.to_string(), unusable(&what)),
             (None, _) => scene.skip(time.to_string(), NO_IMAGE),
         }
     }
-    // Time stamps increase, so that no image is counted twice.
-    scene.num_without_camera = images.len().saturating_sub(scene.photos.len());
     Ok(scene)
 }
 
 /// Finds the image of every time stamp, with a note if the names are not the time stamps.
 fn locate<'a>(times: &[i64], images: &'a [PathBuf]) -> (Vec<Option<&'a PathBuf>>, Option<String>) {
-    let numbered = numbered_images(images);
+    let number = |path: &'a PathBuf| Some((path.file_stem()?.to_str()?.parse::<i64>().ok()?, path));
+    // Of `77` and `077`, the first in order of names.
+    let numbered: BTreeMap<i64, &PathBuf> = images.iter().rev().filter_map(number).collect();
     let exact: Vec<_> = times.iter().map(|time| numbered.get(time).copied()).collect();
     let num_exact = exact.iter().flatten().count();
     if num_exact == times.len().min(numbered.len()) && num_exact > 1 {
@@ -62,25 +60,19 @@ fn locate<'a>(times: &[i64], images: &'a [PathBuf]) -> (Vec<Option<&'a PathBuf>>
     if images.len() == times.len() && num_near <= times.len() / 2 {
         return (images.iter().map(Some).collect(), Some("the images are taken in the order of their names".into()));
     }
-    let note = format!(
-        "the names of {} differ from the time stamps, by less than half a frame",
-        plural(num_near - num_exact, "image")
-    );
+    let count = plural(num_near - num_exact, "image");
+    let note = format!("the names of {count} differ from the time stamps, by less than half a frame");
     (near, (num_near > num_exact).then_some(note))
 }
 
 /// A time stamp with its camera, or why the camera cannot be used.
 type Line = (i64, Result<ScaledCamera, String>);
 
-/// Returns the URL and the cameras.
-fn parse(text: &str) -> Result<(String, Vec<Line>), String> {
-    let (mut url, mut lines) = (String::new(), Vec::<Line>::new());
+fn parse(text: &str) -> Result<Vec<Line>, String> {
+    let mut lines = Vec::<Line>::new();
     for (number, line) in text.lines().enumerate() {
         // The first line is the URL of the video; some tools omit it.
         let is_url = number == 0 && line.split_ascii_whitespace().count() < NUM_COLUMNS;
-        if is_url {
-            url = line.trim().chars().take(MAX_URL_CHARS).collect();
-        }
         if line.trim().is_empty() || is_url {
             continue;
         }
@@ -94,7 +86,7 @@ fn parse(text: &str) -> Result<(String, Vec<Line>), String> {
         }
         lines.push((time, camera));
     }
-    Ok((url, lines))
+    Ok(lines)
 }
 
 /// Parses a line of the right form; words that are no numbers make the camera unusable.

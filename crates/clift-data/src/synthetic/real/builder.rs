@@ -4,8 +4,7 @@ use std::f32::consts::TAU;
 
 use glam::{EulerRot, Mat3, Vec3};
 
-use crate::synthetic::real::dice::Dice;
-use crate::synthetic::real::palette::Palette;
+use crate::synthetic::real::dice::{Dice, Palette};
 use crate::synthetic::tracing::solid::{Shape, Solid};
 use crate::synthetic::tracing::surface::Surface;
 
@@ -33,7 +32,6 @@ impl Place {
         self.at + self.right * x + self.forward * z - Vec3::Y * height
     }
 
-    /// Returns the place moved and turned relative to this one.
     pub fn then(&self, x: f32, height: f32, z: f32, yaw: f32) -> Self {
         let (sin, cos) = yaw.sin_cos();
         let forward = self.forward * cos + self.right * sin;
@@ -45,7 +43,6 @@ impl Place {
     }
 }
 
-/// The solids and surfaces of a scene in the making.
 pub(crate) struct Builder {
     pub dice: Dice,
     pub palette: Palette,
@@ -59,7 +56,6 @@ impl Builder {
         Self { dice, palette, solids: Vec::new(), surfaces: Vec::new() }
     }
 
-    /// Adds a surface and returns its number.
     pub fn surface(&mut self, surface: Surface) -> usize {
         self.surfaces.push(surface);
         self.surfaces.len() - 1
@@ -104,7 +100,6 @@ impl Builder {
         self.upright(place, Shape::Ball, [x, z], heights, [half[0], half[2]], surface);
     }
 
-    /// Adds a rod between two points of a place.
     pub fn rod(&mut self, place: &Place, from: [f32; 3], to: [f32; 3], radius: f32, surface: usize) {
         let [from, to] = [from, to].map(|[x, height, z]| place.point(x, height, z));
         let along = (to - from).normalize_or(Vec3::Y);

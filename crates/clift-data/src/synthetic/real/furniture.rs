@@ -8,7 +8,6 @@ use crate::synthetic::real::builder::{Builder, Place};
 use crate::synthetic::tracing::solid::Shape;
 
 impl Builder {
-    /// Adds a table with four legs and things on it.
     pub fn table(&mut self, place: &Place, [wide, deep]: [f32; 2], height: f32) {
         let (top, thick) = (self.board(), self.dice.between(0.02, 0.06));
         let leg = self.dice.between(0.02, 0.05);
@@ -26,7 +25,6 @@ impl Builder {
         self.things_on(place, [wide * 0.8, deep * 0.8], height, things);
     }
 
-    /// Adds small things on a surface of these half sizes.
     pub fn things_on(&mut self, place: &Place, [wide, deep]: [f32; 2], height: f32, count: usize) {
         for _ in 0..count {
             let (x, z) = (self.dice.swing(wide), self.dice.swing(deep));
@@ -167,7 +165,6 @@ impl Builder {
         self.block(place, [-wide, wide], [low, high], [0.0, 0.035], picture);
     }
 
-    /// Adds a pot with leaves.
     pub fn plant(&mut self, place: &Place, size: f32) {
         let (pot, leaves) = (self.any_paint(), self.foliage());
         self.column(place, [0.0, 0.0], [0.0, 0.35 * size], 0.2 * size, pot);
@@ -179,7 +176,6 @@ impl Builder {
         }
     }
 
-    /// Adds a trunk with branches and a crown.
     pub fn tree(&mut self, place: &Place, size: f32) {
         let (bark, leaves) = (self.board(), self.foliage());
         let trunk = 0.03 * size * self.dice.between(0.6, 1.5);
@@ -196,7 +192,6 @@ impl Builder {
         }
     }
 
-    /// Adds a row of posts with rails between two points.
     pub fn fence(&mut self, place: &Place, half: f32, high: f32) {
         let (board, radius) = (self.board(), self.dice.between(0.015, 0.05));
         let posts = self.dice.count(4, 14);
@@ -241,7 +236,6 @@ impl Builder {
         }
     }
 
-    /// Adds a monument: steps, a shaft, and things on top and around.
     pub fn monument(&mut self, place: &Place, radius: f32) {
         let (stone, other) = (self.facade(false), self.anything_surface());
         let mut height = 0.0;

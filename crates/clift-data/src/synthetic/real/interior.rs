@@ -5,11 +5,10 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 
 use crate::synthetic::real::builder::{Builder, Place};
+use crate::synthetic::tracing::surface::Surface;
 
-/// Thickness of a wall.
 const THICK: f32 = 0.15;
 
-/// Ground plan of a room.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Plan {
     pub center: [f32; 2],
@@ -100,7 +99,6 @@ impl Builder {
         }
     }
 
-    /// Samples a door or a wide passage.
     fn passage(&mut self, long: f32, height: f32) -> Opening {
         let dice = &mut self.dice;
         let half = if dice.chance(0.5) { dice.between(0.38, 0.55) } else { dice.between(0.6, 0.9 * long.max(0.7)) };
@@ -109,7 +107,6 @@ impl Builder {
         Opening { x: [middle - half, middle + half], height: [0.0, dice.between(1.95, height.min(2.6))] }
     }
 
-    /// Adds the room behind an opening.
     fn neighbour(
         &mut self,
         plan: &Plan,
@@ -138,7 +135,6 @@ impl Builder {
         self.room(&Plan { center: [center.x, center.z], half, height }, &own, depth + 1, Some(back), windows);
     }
 
-    /// Adds windows with frames and curtains, and returns their openings.
     fn windows(
         &mut self,
         place: &Place,
@@ -188,7 +184,6 @@ impl Builder {
         openings
     }
 
-    /// Adds a wall around its openings, with skirting and frames.
     fn wall(&mut self, place: &Place, long: f32, height: f32, openings: &[Opening], surface: usize, trim: usize) {
         let z = [-THICK, 0.0];
         let mut start = -long - THICK;
@@ -222,7 +217,7 @@ impl Builder {
 
     fn on_ceiling(&mut self, place: &Place, plan: &Plan, finish: &Finish) {
         let Plan { half: [wide, deep], height, .. } = *plan;
-        let glow = self.glowing(Vec3::new(1.0, 0.93, 0.8), 3.0);
+        let glow = self.surface(Surface { glow: 3.0, ..Surface::plain(Vec3::new(1.0, 0.93, 0.8)) });
         match self.dice.count(0, 5) {
             0 => {
                 for index in 0..self.dice.count(2, 8) {
@@ -247,7 +242,6 @@ impl Builder {
         }
     }
 
-    /// Places furniture and pictures along a wall, between its openings.
     fn furnish(&mut self, place: &Place, long: f32, openings: &[Opening], depth: usize) {
         let mut start = -long + 0.05;
         while start < long - 0.4 {
@@ -305,7 +299,6 @@ impl Builder {
         }
     }
 
-    /// Places rugs, tables and seats away from the walls.
     fn middle(&mut self, plan: &Plan) {
         let Plan { center: [x, z], half: [wide, deep], .. } = *plan;
         let count = self.dice.count(0, if wide * deep > 5.0 { 4 } else { 2 });

@@ -5,11 +5,10 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 
 use crate::synthetic::real::builder::Builder;
-use crate::synthetic::real::palette::{leaf, stone, wood};
+use crate::synthetic::real::dice::{leaf, stone, wood};
 use crate::synthetic::tracing::surface::{Pattern, Surface};
 
 impl Builder {
-    /// Returns a surface in these colours with some noise on its brightness.
     fn patterned(&mut self, pattern: Pattern, colors: [Vec3; 3], rate: f32, noise: f32) -> Surface {
         let dice = &mut self.dice;
         let grain = dice.between(0.2, 1.0) * noise;
@@ -24,7 +23,6 @@ impl Builder {
         }
     }
 
-    /// Adds a surface of one colour, with slight noise.
     pub fn painted(&mut self, color: Vec3, gloss: f32) -> usize {
         let surface = self.patterned(Pattern::Plain, [color; 3], 1.0, 0.16);
         self.surface(Surface { gloss, ..surface })
@@ -36,11 +34,6 @@ impl Builder {
         self.painted(color, gloss)
     }
 
-    pub fn glowing(&mut self, color: Vec3, glow: f32) -> usize {
-        self.surface(Surface { glow, ..Surface::plain(color) })
-    }
-
-    /// Adds a wall: mostly pale and plain, sometimes papered, panelled or of bricks.
     pub fn wall_surface(&mut self) -> usize {
         let base = self.palette.wall(&mut self.dice);
         let second = base * self.dice.between(0.5, 0.92);
@@ -60,7 +53,6 @@ impl Builder {
         self.surface(surface)
     }
 
-    /// Adds a floor: boards, tiles, carpet or stone; sometimes polished.
     pub fn floor_surface(&mut self) -> usize {
         let quarter = if self.dice.chance(0.5) { [0.0, 1.0] } else { [1.0, 0.0] };
         let surface = match self.dice.count(0, 9) {
@@ -97,7 +89,6 @@ impl Builder {
         self.surface(Surface { gloss, turn: quarter, ..surface })
     }
 
-    /// Adds wood with its grain, or a painted board.
     pub fn board(&mut self) -> usize {
         let base = match self.dice.count(0, 9) {
             0..=5 => wood(&mut self.dice),
@@ -111,7 +102,6 @@ impl Builder {
         self.surface(Surface { gloss, ..surface })
     }
 
-    /// Adds cloth: plain, striped, checked or printed.
     pub fn cloth(&mut self) -> usize {
         let base = self.palette.any(&mut self.dice);
         let others = [(); 2].map(|()| self.palette.any(&mut self.dice));
@@ -129,7 +119,6 @@ impl Builder {
         self.surface(surface)
     }
 
-    /// Adds a picture, poster, screen or page.
     pub fn picture(&mut self) -> usize {
         let colors = [(); 3].map(|()| self.palette.any(&mut self.dice));
         let (pattern, rate) = match self.dice.count(0, 9) {
@@ -164,7 +153,6 @@ impl Builder {
         self.surface(surface)
     }
 
-    /// Adds a ground for outdoors: grass, earth, paving or asphalt.
     pub fn ground_surface(&mut self) -> usize {
         let surface = match self.dice.count(0, 3) {
             0 => {
@@ -209,7 +197,6 @@ impl Builder {
         self.surface(surface)
     }
 
-    /// Adds any of the surfaces of things, with its pattern turned at random.
     pub fn anything_surface(&mut self) -> usize {
         let number = match self.dice.count(0, 9) {
             0..=2 => self.any_paint(),

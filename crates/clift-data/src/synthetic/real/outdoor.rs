@@ -41,7 +41,6 @@ impl Builder {
         }
     }
 
-    /// Adds a house with a roof, windows and a door towards -z of the place.
     fn house(&mut self, place: &Place, distance: f32) {
         let dice = &mut self.dice;
         let (wide, deep) = (dice.between(2.0, 7.0), dice.between(2.0, 5.0));

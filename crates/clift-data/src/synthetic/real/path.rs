@@ -12,7 +12,6 @@ use crate::synthetic::tracing::world::{GROUND, SKY, World};
 
 /// Attempts to find a path on which the camera sees enough; afterwards the best one found counts.
 const ATTEMPTS: usize = 24;
-/// Score at which no better path is looked for.
 const GOOD: f32 = 0.85;
 /// Number of rays along each side of the views that check a path.
 const GLANCE: usize = 6;
@@ -20,14 +19,12 @@ const GLANCE: usize = 6;
 /// then begin at any pixel, as those of shifted patch grids do.
 const OFF_CENTER: f32 = 1.0 / 32.0;
 
-/// Region that a camera path may enter.
 pub(crate) struct Area {
     /// Middle and half sizes of the box in which a path starts (y is down).
     pub center: Vec3,
     pub half: Vec3,
     /// Middle and radius of the thing that arcs turn around.
     pub thing: Option<(Vec3, f32)>,
-    /// Smallest distance to any surface.
     pub clearance: f32,
 }
 
@@ -144,7 +141,6 @@ impl Path {
         Route::Move { at: [start, velocity, bend], look: [yaw, pitch], turn }
     }
 
-    /// Returns positions along the path.
     pub fn positions(&self) -> Vec<Vec3> {
         (0..=64).map(|step| self.position(step as f32 / 64.0)).collect()
     }
@@ -239,7 +235,6 @@ impl Path {
         }
     }
 
-    /// Returns the factor of a frame's exposure.
     pub fn exposure(&self, frame: usize) -> f32 {
         (self.spread.stops * self.difference(frame, 2)).exp2()
     }

@@ -8,10 +8,8 @@ use crate::synthetic::tracing::world::{SKY, World};
 
 /// Distance between a surface and the rays that start there.
 const OFFSET: f32 = 2e-3;
-/// Smallest weight of a mirrored ray.
 const LEAST_MIRROR: f32 = 0.03;
 
-/// Lamp or sun.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Key {
     Sun {
@@ -45,20 +43,17 @@ pub(crate) struct Light {
     pub fills: Vec<Fill>,
     /// Sky at the horizon and above.
     pub sky: [Vec3; 2],
-    /// Strength of clouds.
     pub clouds: f32,
     pub seed: u32,
     /// Distance at which half of the light is haze.
     pub haze: f32,
 }
 
-/// A point where a ray ends.
 #[derive(Clone, Copy)]
 pub(crate) struct End {
     pub origin: Vec3,
     pub direction: Vec3,
     pub distance: f32,
-    /// Number of the solid.
     pub number: usize,
     pub normal: Vec3,
 }
@@ -186,53 +181,4 @@ fn around(normal: Vec3) -> [Vec3; 4] {
     let one = normal.any_orthonormal_vector();
     let other = normal.cross(one);
     [one, other, -one, -other].map(|side| normal * 0.64 + side * 0.77)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::Mat3;
-
-    use crate::synthetic::tracing::solid::{Shape, Solid};
-    use crate::synthetic::tracing::surface::Surface;
-    use crate::synthetic::tracing::world::GROUND;
-
-    /// A white ball above a white ground, below a lamp.
-    fn below_a_ball(gloss: f32, at: Vec3, from: Vec3) -> f32 {
-        let solids = vec![Solid::new(Shape::Ball, Vec3::NEG_Y, Vec3::splat(0.4), Mat3::IDENTITY, 0)];
-        let world = World::new(solids, vec![Surface { gloss, ..Surface::plain(Vec3::splat(0.5)) }], (0.0, 0));
-        let light = Light {
-            key: Key::Lamp { at: Vec3::NEG_Y * 3.0, reach: 5.0 },
-            key_color: Vec3::ONE,
-            softness: 0.1,
-            ambient: [Vec3::splat(0.2); 2],
-            reach: 1.0,
-            fills: Vec::new(),
-            sky: [Vec3::ONE; 2],
-            clouds: 0.0,
-            seed: 0,
-            haze: 1e9,
-        };
-        let (direction, distance) = ((at - from).normalize(), at.distance(from));
-        let end = End { origin: from, direction, distance, number: GROUND, normal: Vec3::NEG_Y };
-        light.seen(&world, [None, Some(end), None, None], 0.01)[1].y
-    }
-
-    #[test]
-    fn ground_below_a_ball_is_in_shadow() {
-        let seen = |x: f32| below_a_ball(0.0, Vec3::X * x, Vec3::new(2.0, -1.0, 1.0));
-        assert!(seen(0.0) < 0.5 * seen(1.5), "{} below, {} beside", seen(0.0), seen(1.5));
-    }
-
-    #[test]
-    fn only_polished_surfaces_depend_on_the_view() {
-        let at = Vec3::X * 1.5;
-        let views = [Vec3::new(3.0, -2.0, 0.0), Vec3::new(-3.0, -2.0, 1.0)];
-        let difference = |gloss: f32| {
-            let [one, other] = views.map(|from| below_a_ball(gloss, at, from));
-            (one - other).abs()
-        };
-        assert!(difference(0.0) < 1e-4, "{}", difference(0.0));
-        assert!(difference(0.8) > 0.02, "{}", difference(0.8));
-    }
 }

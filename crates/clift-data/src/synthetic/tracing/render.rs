@@ -15,10 +15,8 @@ const TILE: usize = 8;
 /// Smallest cosine between normals that one shading stands for.
 const SAME_NORMAL: f32 = 0.95;
 
-/// From light to display values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Exposure {
-    /// Exposure with white balance.
     pub gain: Vec3,
     /// Strength of the S-shaped curve, 0 to 1.
     pub contrast: f32,
@@ -27,7 +25,6 @@ pub(crate) struct Exposure {
 }
 
 impl Exposure {
-    /// Converts linear light to display values in `[0, 1]`.
     pub fn display(&self, light: Vec3) -> Vec3 {
         let light = light * self.gain;
         let grey = light.dot(Vec3::new(0.3, 0.6, 0.1));
@@ -48,7 +45,6 @@ struct Part {
 
 const NOTHING: Part = Part { number: SKY, normal: Vec3::ZERO, pixels: [(Vec3::ZERO, 0.0, 0.0); 4] };
 
-/// The parts of a block: at most one per ray.
 struct Parts {
     parts: [Part; 16],
     count: usize,
@@ -76,7 +72,7 @@ pub(crate) fn render(
                 [(0, 0), (TILE, 0), (0, TILE), (TILE, TILE)].map(|(x, y)| rotation * slope(left + x, top + y));
             let low = corners.into_iter().fold(Vec3::INFINITY, Vec3::min);
             let high = corners.into_iter().fold(Vec3::NEG_INFINITY, Vec3::max);
-            world.ahead(origin, [low, high], &mut ahead);
+            world.tree.ahead(&world.solids, origin, [low, high], &mut ahead);
             for (left, top) in (0..TILE * TILE / 4).map(|at| (left + at % (TILE / 2) * 2, top + at / (TILE / 2) * 2)) {
                 let places = [0, 1, 2, 3].map(|index| (left + index % 2, top + index / 2));
                 let inside = |(column, row): (usize, usize)| column < width && row < height;
@@ -99,7 +95,6 @@ pub(crate) fn render(
 }
 
 impl Parts {
-    /// Adds the ends of the four rays of a pixel.
     fn add(&mut self, world: &World, origin: Vec3, rays: &Rays, ends: (Vec4, [usize; 4]), pixel: usize) {
         let (distances, numbers) = ends;
         let (distances, directions) = (distances.to_array(), rays.directions());

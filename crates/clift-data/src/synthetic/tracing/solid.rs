@@ -10,7 +10,6 @@ const LEAST_SLOPE: f32 = 1e-7;
 pub(crate) enum Shape {
     Block,
     Ball,
-    /// Round about y.
     Column,
     /// Triangle with the base at y = 1 and the ridge along z at y = -1.
     Roof,
@@ -32,13 +31,11 @@ impl Rays {
         Self { origin: origin.to_array().map(Vec4::splat), direction: [a * scale, b * scale, c * scale] }
     }
 
-    /// Returns the directions of the four rays.
     pub fn directions(&self) -> [Vec3; 4] {
         let [a, b, c] = self.direction.map(|lanes| lanes.to_array());
         [0, 1, 2, 3].map(|lane| Vec3::new(a[lane], b[lane], c[lane]))
     }
 
-    /// Returns rays from these origins.
     pub fn new(origins: [Vec3; 4], directions: [Vec3; 4]) -> Self {
         let lanes = |v: [Vec3; 4]| [0, 1, 2].map(|axis| Vec4::from_array(v.map(|v| v[axis])));
         Self { origin: lanes(origins), direction: lanes(directions) }
@@ -94,7 +91,6 @@ impl Spans {
     }
 }
 
-/// A shape, stretched, turned and moved.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Solid {
     pub shape: Shape,
@@ -103,7 +99,6 @@ pub(crate) struct Solid {
     pub half: Vec3,
     /// Own axes as columns, of length 1.
     pub axes: Mat3,
-    /// Index of the surface in the scene.
     pub surface: usize,
     /// Point from which the coordinates of the pattern are measured; pieces of one wall share it.
     pub anchor: Vec3,
@@ -126,7 +121,6 @@ impl Solid {
         [self.center - reach, self.center + reach]
     }
 
-    /// Intersects four lines with the solid.
     pub fn spans(&self, rays: &Rays) -> Spans {
         let m = &self.to_own;
         let from = [
@@ -156,7 +150,6 @@ impl Solid {
         }
     }
 
-    /// Returns the outward normal at a point of the surface.
     pub fn normal(&self, point: Vec3) -> Vec3 {
         let own = self.to_own * (point - self.center);
         let outwards = match self.shape {
@@ -212,52 +205,5 @@ fn largest_axis(v: Vec3) -> Vec3 {
         Vec3::Y * v.y.signum()
     } else {
         Vec3::Z * v.z.signum()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::synthetic::real::dice::Dice;
-    use clift_core::step_rng;
-
-    /// Returns whether a point lies in the shape, by its definition.
-    fn contains(solid: &Solid, point: Vec3) -> bool {
-        let Vec3 { x, y, z } = solid.axes.transpose() * (point - solid.center) / solid.half;
-        match solid.shape {
-            Shape::Block => x.abs().max(y.abs()).max(z.abs()) < 1.0,
-            Shape::Ball => x * x + y * y + z * z < 1.0,
-            Shape::Column => x * x + z * z < 1.0 && y.abs() < 1.0,
-            Shape::Roof => z.abs() < 1.0 && y < 1.0 && x.abs() < 0.5 * (y + 1.0),
-        }
-    }
-
-    #[test]
-    fn rays_enter_and_leave_where_the_shape_begins_and_ends() {
-        let mut dice = Dice(step_rng(2, 0, "test"));
-        let mut hits = 0;
-        for shape in [Shape::Block, Shape::Ball, Shape::Column, Shape::Roof] {
-            for _ in 0..300 {
-                let mut point = |size: f32| Vec3::new(dice.swing(size), dice.swing(size), dice.swing(size));
-                let axes = Mat3::from_rotation_y(point(3.0).x) * Mat3::from_rotation_z(point(3.0).y);
-                let solid = Solid::new(shape, point(1.0), point(1.0).abs() + 0.2, axes, 0);
-                let origin = point(1.0).normalize() * 6.0;
-                let direction = (point(1.0) - origin).normalize();
-                let spans = solid.spans(&Rays::new([origin; 4], [direction; 4]));
-                let at = |distance: f32| contains(&solid, origin + direction * distance);
-                let (near, far) = (spans.near.x, spans.far.x);
-                if near > far - 0.01 {
-                    continue;
-                }
-                hits += 1;
-                assert!(!at(near - 2e-3) && at(near + 2e-3) && at(far - 2e-3) && !at(far + 2e-3), "{solid:?}");
-                let entry = origin + direction * near;
-                let normal = solid.normal(entry);
-                assert!((normal.length() - 1.0).abs() < 1e-4 && normal.dot(direction) < 1e-3, "{normal}");
-                assert!(!contains(&solid, entry + normal * 2e-3), "the normal points outwards: {solid:?}");
-                assert!(solid.distance(entry) < 1e-3 && solid.distance(origin) < near + 1e-3);
-            }
-        }
-        assert!(hits > 400, "{hits}");
     }
 }

@@ -8,12 +8,10 @@ use crate::synthetic::tracing::noise::{byte, edge, floor, hash, octaves, pulse, 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Pattern {
     Plain,
-    /// From one colour to another and back.
     Gradient,
     Stripes {
         duty: f32,
     },
-    /// Stripes both ways.
     Plaid {
         duty: f32,
     },
@@ -29,7 +27,6 @@ pub(crate) enum Pattern {
         gain: f32,
         sharp: f32,
     },
-    /// Long noise, as the grain of wood.
     Grain,
     /// Signs of 3 x 5 dots in lines, as writing.
     Glyphs,
@@ -89,7 +86,6 @@ pub(crate) struct Surface {
     pub grain_rate: f32,
     /// 0 is matt, 1 is polished.
     pub gloss: f32,
-    /// Own light, in units of the colour.
     pub glow: f32,
 }
 
@@ -205,7 +201,6 @@ impl Surface {
         color
     }
 
-    /// Returns a colour between the three, of random brightness.
     fn mix(&self, state: u32) -> Vec3 {
         let tint = self.colors[0].lerp(self.colors[1], byte(state, 0));
         let tint = if state & 0x7000 == 0 { self.colors[2] } else { tint };
@@ -280,44 +275,4 @@ pub(crate) fn linear_color(hue: f64, saturation: f64, value: f64) -> Vec3 {
         (shade * shade) as f32
     });
     channels.into()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn hues_a_third_apart_are_red_green_and_blue() {
-        assert_eq!(linear_color(0.0, 1.0, 1.0), Vec3::new(1.0, 0.0, 0.0));
-        assert_eq!(linear_color(1.0 / 3.0, 1.0, 1.0), Vec3::new(0.0, 1.0, 0.0));
-        assert_eq!(linear_color(-1.0 / 3.0, 1.0, 0.5), Vec3::new(0.0, 0.0, 0.25));
-        assert_eq!(linear_color(0.4, 0.0, 1.0), Vec3::ONE);
-    }
-
-    #[test]
-    fn patterns_have_contrast_near_and_none_far_away() {
-        let colors = [Vec3::splat(0.2), Vec3::splat(0.7), Vec3::splat(0.05)];
-        for pattern in [
-            Pattern::Stripes { duty: 0.4 },
-            Pattern::Plaid { duty: 0.4 },
-            Pattern::Checks,
-            Pattern::Bricks { stretch: 2.0, joint: 0.1, shift: 0.0 },
-            Pattern::Clouds { gain: 0.7, sharp: 2.0 },
-            Pattern::Grain,
-            Pattern::Glyphs,
-            Pattern::Discs,
-            Pattern::Books,
-            Pattern::Panes { width: 0.6, height: 0.6 },
-        ] {
-            let surface = Surface { pattern, colors, seed: 3, ..Surface::plain(colors[0]) };
-            let deviation = |width: f32| {
-                let values: Vec<f32> =
-                    (0..1000).map(|i| surface.color(i as f32 * 0.173, i as f32 * 0.091, width).y).collect();
-                let mean = values.iter().sum::<f32>() / 1000.0;
-                (values.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / 1000.0).sqrt()
-            };
-            let (near, far) = (deviation(0.01), deviation(16.0));
-            assert!(near > 0.02 && far < 0.15 * near, "{pattern:?}: {near} near, {far} far");
-        }
-    }
 }

@@ -4,7 +4,6 @@ use glam::{Vec3, Vec4};
 
 use crate::synthetic::tracing::solid::{Rays, Solid};
 
-/// Largest number of solids in a leaf.
 const LEAF: usize = 3;
 /// Entries of the stack of a walk. A part is split at least 1 to [`BALANCE`], which keeps the depth below it.
 const DEPTH: usize = 64;
@@ -21,7 +20,6 @@ struct Node {
     next: u32,
     /// Number of solids; 0 for an inner node.
     count: u16,
-    /// Axis along which the children are ordered.
     axis: u16,
 }
 
@@ -210,42 +208,4 @@ fn divide(order: &mut [([Vec3; 2], u32)]) -> (usize, usize) {
     let axis = (high - low).max_position();
     order.sort_by(|a, b| middle(a)[axis].total_cmp(&middle(b)[axis]));
     (axis, order.len() / 2)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::Mat3;
-
-    use crate::synthetic::real::dice::Dice;
-    use crate::synthetic::tracing::solid::Shape;
-    use crate::synthetic::tracing::world::World;
-    use clift_core::step_rng;
-
-    #[test]
-    fn walks_and_lists_find_the_nearest_of_all_solids() {
-        let mut dice = Dice(step_rng(1, 0, "test"));
-        let shapes = [Shape::Block, Shape::Ball, Shape::Column, Shape::Roof];
-        for count in [0, 1, 5, 60, 300] {
-            let mut point = |size: f32| Vec3::new(dice.swing(size), dice.swing(size), dice.swing(size));
-            let solid = |number: usize| {
-                let axes = Mat3::from_rotation_y(point(3.0).x) * Mat3::from_rotation_x(point(3.0).y);
-                Solid::new(shapes[number % 4], point(5.0), point(0.8).abs(), axes, number)
-            };
-            let world = World::new((0..count).map(solid).collect(), Vec::new(), (9.0, 0));
-            for _ in 0..100 {
-                let (origin, middle) = (point(6.0), point(1.0));
-                let directions = [(); 4].map(|()| middle + point(0.1));
-                let low = directions.into_iter().reduce(Vec3::min).unwrap();
-                let high = directions.into_iter().reduce(Vec3::max).unwrap();
-                let length = directions.map(Vec3::length).into_iter().reduce(f32::min).unwrap();
-                let rays = Rays::new([origin; 4], directions.map(Vec3::normalize));
-                let mut all: Vec<(f32, usize)> = (0..count).map(|number| (0.0, number)).collect();
-                let expected = world.nearest_of(&rays, &all);
-                assert_eq!(world.nearest(&rays), expected);
-                world.ahead(origin, [low / length, high / length], &mut all);
-                assert_eq!(world.nearest_of(&rays, &all), expected);
-            }
-        }
-    }
 }

@@ -6,9 +6,7 @@ use crate::synthetic::tracing::solid::{Rays, Solid};
 use crate::synthetic::tracing::surface::Surface;
 use crate::synthetic::tracing::tree::Tree;
 
-/// Number of the ground among the solids.
 pub(crate) const GROUND: usize = usize::MAX - 1;
-/// Number of the sky among the solids.
 pub(crate) const SKY: usize = usize::MAX;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -17,7 +15,7 @@ pub(crate) struct World {
     pub surfaces: Vec<Surface>,
     /// Height of the ground, downwards, and its surface.
     pub ground: (f32, usize),
-    tree: Tree,
+    pub tree: Tree,
 }
 
 impl World {
@@ -53,11 +51,6 @@ impl World {
         ends
     }
 
-    /// Lists the solids that a pyramid of rays may meet; see [`Tree::ahead`].
-    pub fn ahead(&self, origin: Vec3, directions: [Vec3; 2], found: &mut Vec<(f32, usize)>) {
-        self.tree.ahead(&self.solids, origin, directions, found);
-    }
-
     fn to_ground(&self, rays: &Rays) -> (Vec4, [usize; 4]) {
         let down = (Vec4::splat(self.ground.0) - rays.origin[1]) / rays.direction[1];
         let hit = down.cmpgt(Vec4::ZERO) & down.cmplt(Vec4::splat(1e6));
@@ -83,7 +76,6 @@ impl World {
         true
     }
 
-    /// Returns the distance at which one ray ends, and the number of the solid there.
     pub fn first(&self, origin: Vec3, direction: Vec3) -> (f32, usize) {
         let (distances, numbers) = self.nearest(&Rays::new([origin; 4], [direction; 4]));
         (distances.x, numbers[0])
@@ -118,7 +110,6 @@ impl World {
         free / reach
     }
 
-    /// Returns the normal at a point of the surface with this number.
     pub fn normal(&self, number: usize, point: Vec3) -> Vec3 {
         if number == GROUND { Vec3::NEG_Y } else { self.solids[number].normal(point) }
     }
@@ -134,14 +125,12 @@ impl World {
         (surface, surface.color(u, v, width))
     }
 
-    /// Removes the solids that are nearer than `clearance` to one of the points.
     pub fn clear_away(self, points: &[Vec3], clearance: f32) -> Self {
         let Self { mut solids, surfaces, ground, .. } = self;
         solids.retain(|solid| points.iter().all(|&point| solid.distance(point) > clearance));
         Self::new(solids, surfaces, ground)
     }
 
-    /// Returns whether every solid and the ground are at least `clearance` away from a point.
     pub fn is_clear(&self, point: Vec3, clearance: f32) -> bool {
         point.y + clearance < self.ground.0 && self.solids.iter().all(|solid| solid.distance(point) > clearance)
     }

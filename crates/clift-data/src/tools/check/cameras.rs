@@ -7,18 +7,12 @@ use crate::tools::check::result::SceneCheck;
 
 /// Plausible fields of view, in degrees.
 const FOV_DEG: [f64; 2] = [5.0, 120.0];
-/// Field of view above which published configs skip a scene, in degrees.
-const FILTERED_FOV_DEG: f64 = 100.0;
 /// Plausible principal points, over width and height.
 const PRINCIPAL_POINT: [f64; 2] = [0.25, 0.75];
-/// Aspect ratio of a pixel, or the inverse, above which a note is added.
-const NOTED_ASPECT: f64 = 1.02;
 /// Aspect ratio of a pixel, or the inverse, above which a scene fails.
 const MAX_ASPECT: f64 = 1.5;
 /// Entry of `R^T R - I` above which a scene fails; files with four digits stay below.
 const MAX_DEFECT: f64 = 1e-3;
-/// Entry of `R^T R - I` above which a note is added; f32 files stay below.
-const NOTED_DEFECT: f64 = 1e-4;
 
 pub(crate) fn check_cameras(cameras: &[Camera<IntrinsicsNorm>], sizes: &Sizes, check: &mut SceneCheck) {
     if cameras.is_empty() {
@@ -29,11 +23,9 @@ pub(crate) fn check_cameras(cameras: &[Camera<IntrinsicsNorm>], sizes: &Sizes, c
     let defects = cameras.iter().map(|camera| camera.c2w.orthonormality_defect());
     let worst = defects.fold(0.0, f64::max);
     check.rotation_defect = Some(worst);
-    let sentence = format!("rotations depart from orthonormal ones by up to {worst:.1e}");
     if worst > MAX_DEFECT {
-        check.reasons.push(format!("{sentence}, more than {MAX_DEFECT:.0e}"));
-    } else if worst > NOTED_DEFECT {
-        check.notes.push(sentence);
+        let what = format!("rotations depart from orthonormal ones by up to {worst:.1e}, more than {MAX_DEFECT:.0e}");
+        check.reasons.push(what);
     }
     let poses: Vec<Pose> = cameras.iter().map(|camera| camera.c2w).collect();
     let found = PoseNormalization::find(&check.key, &poses, &[], PoseRotation::Quaternion, PoseScale::Context);
@@ -62,10 +54,6 @@ fn check_intrinsics(cameras: &[Camera<IntrinsicsNorm>], sizes: &Sizes, check: &m
         let frames = check.list_frames(&implausible);
         let what = format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}");
         check.reasons.push(what);
-    } else if widest > FILTERED_FOV_DEG {
-        check.notes.push(format!(
-            "a field of view of {widest:.1} degrees; published filters skip scenes above {FILTERED_FOV_DEG}"
-        ));
     }
     let [low, high] = PRINCIPAL_POINT;
     let middle = low..=high;
@@ -87,10 +75,9 @@ fn check_intrinsics(cameras: &[Camera<IntrinsicsNorm>], sizes: &Sizes, check: &m
     });
     let off = |aspect: f64| aspect.max(1.0 / aspect);
     let Some(worst) = aspects.reduce(|a, b| if off(b) > off(a) { b } else { a }) else { return };
-    let sentence = format!("focal lengths in pixels have the ratio fx / fy = {worst:.3}");
     if off(worst) > MAX_ASPECT {
-        check.reasons.push(format!("{sentence}: the intrinsics may belong to another image size"));
-    } else if off(worst) > NOTED_ASPECT {
-        check.notes.push(format!("{sentence}: pixels are not square"));
+        check.reasons.push(format!(
+            "focal lengths in pixels have the ratio fx / fy = {worst:.3}: the intrinsics may belong to another image size"
+        ));
     }
 }

@@ -1,53 +1,39 @@
 //! Check of the poses against the images: matched corners must lie on each other's epipolar lines, and where other frames
 //! place them.
 
-use clift_core::{Camera, IntrinsicsNorm, RgbImage, median};
+use std::fmt;
 
-use crate::scene_source::SceneSource;
+use clift_core::{Camera, IntrinsicsNorm, median};
+use glam::{DMat3, DVec3};
+
 use crate::skip_report::plural;
-use crate::tools::check::drawing::epipolar_image;
-use crate::tools::check::frames::{exchange_neighbours, frame_distances, triplet_distances, wrong_frames};
+use crate::tools::check::frames::{
+    exchange_neighbours, find_triplets, frame_distances, triplet_distances, wrong_frames,
+};
 use crate::tools::check::images::Sizes;
 use crate::tools::check::matches::{FramePair, match_frames, subsample};
-use crate::tools::check::mistakes::Mistake;
 use crate::tools::check::result::{FrameCheck, MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
-use crate::tools::check::triplets::find_triplets;
-use crate::tools::features::epipolar::epipolar_distance;
+use crate::tools::features::epipolar::{PixelCamera, epipolar_distance};
 use crate::tools::features::image_features::Features;
-use crate::tools::features::pixel_camera::PixelCamera;
 
 /// Largest number of matches of one pair in the median of the scene, so that no pair dominates.
 const MAX_MATCHES: usize = 150;
-/// Smallest number of matches of a scene for a median.
 const MIN_MATCHES: usize = 40;
-/// Epipolar distance in pixels above which a note on a pair is added in a scene that passes.
-const NOTED_PX: f64 = 3.0;
 /// Epipolar distance of changed cameras over that of the given ones, in the median over pairs, below which the change is
 /// a mistake of the scene. Right cameras of eight real scenes gave at least 1.03 (docs/guide/data.md).
 const MAX_MISTAKE_RATIO: f64 = 0.93;
 /// Smallest share of the pairs in which the changed cameras fit better.
 const MIN_MISTAKE_SHARE: f64 = 0.6;
 
-/// Frames whose poses are compared with the images.
-pub(crate) struct Compared<'a> {
-    /// Positions in the scene from one frame to the next.
-    pub step: usize,
-    /// Cameras of all frames of the scene.
-    pub cameras: &'a [Camera<IntrinsicsNorm>],
-    /// Sizes of all frames of the scene.
-    pub sizes: &'a Sizes,
-    /// Corners of the compared frames, `None` for an unreadable one.
-    pub features: Vec<Option<Features>>,
-}
-
-/// Compares the poses of a scene with its images. Returns an image of the pair nearest to the median of the scene.
+/// Compares the poses of every `step`-th frame of a scene with the images. `features` are the corners of these frames,
+/// `None` for an unreadable one.
 pub(crate) fn check_poses(
-    source: &dyn SceneSource,
-    scene: usize,
-    compared: &Compared,
+    cameras: &[Camera<IntrinsicsNorm>],
+    sizes: &Sizes,
+    step: usize,
+    features: &[Option<Features>],
     check: &mut SceneCheck,
-) -> Option<RgbImage> {
-    let &Compared { step, cameras, sizes, .. } = compared;
+) {
     let cameras: Vec<Camera<IntrinsicsNorm>> = cameras.iter().copied().step_by(step).collect();
     let sizes = sizes.iter().step_by(step);
     // The camera of an unreadable frame is not used.
@@ -55,7 +41,7 @@ pub(crate) fn check_poses(
         PixelCamera::new(camera, size.unwrap_or([1, 1]))
     };
     let views: Vec<PixelCamera> = cameras.iter().zip(sizes).map(view).collect();
-    let pairs = match_frames(&compared.features, &cameras);
+    let pairs = match_frames(features, &cameras);
     let distances: Vec<Vec<f64>> = pairs.iter().map(|pair| epipolar_distances(&views, pair)).collect();
     let pair_check = |(pair, distances): (&FramePair, &Vec<f64>)| PairCheck {
         frames: pair.frames.map(|frame| frame * step),
@@ -67,7 +53,7 @@ pub(crate) fn check_poses(
     if pooled.len() < MIN_MATCHES {
         let (count, pairs) = (plural(pooled.len(), "matching corner"), plural(pairs.len(), "pair"));
         check.notes.push(format!("poses were not compared with the images: only {count} in {pairs} of frames"));
-        return None;
+        return;
     }
     let scene_px = median(&pooled);
     check.epipolar_px = Some(scene_px);
@@ -81,26 +67,7 @@ pub(crate) fn check_poses(
         Some((mistake, px)) => check.reasons.push(format!(
             "the images fit better with {mistake}: the median epipolar distance is {px:.2} px instead of {scene_px:.2}"
         )),
-        None => check_frames(views.clone(), &pairs, step, check),
-    }
-    note_pairs(check);
-    let off = |(_, pair): &(usize, &PairCheck)| (pair.epipolar_px - scene_px).abs();
-    let (typical, _) = check.pairs.iter().enumerate().min_by(|a, b| off(a).total_cmp(&off(b)))?;
-    let FramePair { frames: [first, second], matches } = &pairs[typical];
-    let images = [source.frame(scene, first * step).ok()?, source.frame(scene, second * step).ok()?];
-    Some(epipolar_image(&images, &PixelCamera::fundamental(&views[*first], &views[*second]), matches))
-}
-
-/// Adds a note on pairs with large distances in a scene that passes.
-fn note_pairs(check: &mut SceneCheck) {
-    let far: Vec<&PairCheck> = check.pairs.iter().filter(|pair| pair.epipolar_px > NOTED_PX).collect();
-    if let Some(PairCheck { frames, epipolar_px, .. }) = far.first().filter(|_| check.reasons.is_empty()) {
-        let [a, b] = frames.map(|frame| check.frame_name(frame));
-        let pairs = plural(far.len(), "pair");
-        check.notes.push(format!(
-            "{pairs} of frames above {NOTED_PX} px, the first {a} and {b} with {epipolar_px:.1} px: a pattern repeats, or \
-             their poses are wrong"
-        ));
+        None => check_frames(views, &pairs, step, check),
     }
 }
 
@@ -117,9 +84,8 @@ fn check_frames(mut views: Vec<PixelCamera>, pairs: &[FramePair], step: usize, c
         let frames = check.list_frames(&alone);
         check.notes.push(format!("{frames} were not compared with two others: too few corners in common"));
     }
-    for exchanged in exchange_neighbours(&mut views, &triplets) {
-        let [given, new] = exchanged.px;
-        let [first, second] = [exchanged.frame, exchanged.frame + 1].map(|frame| check.frame_name(frame * step));
+    for (frame, [given, new]) in exchange_neighbours(&mut views, &triplets) {
+        let [first, second] = [frame, frame + 1].map(|frame| check.frame_name(frame * step));
         check.reasons.push(format!(
             "the cameras of frames {first} and {second} are exchanged: the other frames place corners {given:.1} px away, \
              with the cameras exchanged {new:.1} px"
@@ -138,7 +104,6 @@ fn check_frames(mut views: Vec<PixelCamera>, pairs: &[FramePair], step: usize, c
     }
 }
 
-/// Returns the epipolar distances of the matches of a pair, in pixels.
 fn epipolar_distances(views: &[PixelCamera], FramePair { frames: [a, b], matches }: &FramePair) -> Vec<f64> {
     let geometry = PixelCamera::fundamental(&views[*a], &views[*b]);
     matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect()
@@ -165,4 +130,68 @@ fn find_mistake(views: &[PixelCamera], pairs: &[FramePair]) -> Option<(Mistake, 
         (ratio < MAX_MISTAKE_RATIO && is_usual).then(|| (ratio, mistake, median(&distances.concat())))
     });
     tried.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, mistake, px)| (mistake, px))
+}
+
+const FOCAL_SCALES: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
+const TURNS_DEG: [f64; 2] = [2.0, 4.0];
+
+/// A change of every camera that undoes a usual mistake. Prints what the files hold.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Mistake {
+    /// OpenGL's axes (y up, z backward) for OpenCV's, or the reverse.
+    Axes,
+    /// `w2c` for `c2w`, or the reverse.
+    Inverse,
+    /// Both: `w2c` with OpenGL's axes.
+    InverseAndAxes,
+    /// Focal lengths that fit better after this factor.
+    Focal(f64),
+    /// Cameras that fit better after this turn about an axis of their own, in degrees.
+    Turn([i8; 3], f64),
+}
+
+impl Mistake {
+    pub fn all() -> impl Iterator<Item = Self> {
+        let axes =
+            (0..27).map(|index| [index / 9 - 1, index / 3 % 3 - 1, index % 3 - 1]).filter(|axis| *axis != [0; 3]);
+        let turns = axes.flat_map(|axis| TURNS_DEG.map(|angle_deg| Self::Turn(axis, angle_deg)));
+        [Self::Axes, Self::Inverse, Self::InverseAndAxes].into_iter().chain(FOCAL_SCALES.map(Self::Focal)).chain(turns)
+    }
+
+    pub fn corrected(self, camera: &PixelCamera) -> PixelCamera {
+        let mut camera = *camera;
+        let opposite_axes = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        match self {
+            Self::Axes => camera.c2w.rotation *= opposite_axes,
+            Self::Inverse => camera.c2w = camera.c2w.inverse(),
+            Self::InverseAndAxes => {
+                camera.c2w = camera.c2w.inverse();
+                camera.c2w.rotation *= opposite_axes;
+            }
+            Self::Focal(scale) => camera = camera.with_focal_scale(scale),
+            Self::Turn(axis, angle_deg) => {
+                let axis = DVec3::from_array(axis.map(f64::from)).normalize();
+                camera.c2w.rotation *= DMat3::from_axis_angle(axis, angle_deg.to_radians());
+            }
+        }
+        camera
+    }
+}
+
+impl fmt::Display for Mistake {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Axes => {
+                write!(f, "the y and z axes of every camera reversed (OpenGL's axes for OpenCV's, or the reverse)")
+            }
+            Self::Inverse => write!(f, "every pose inverted (world-to-camera for camera-to-world, or the reverse)"),
+            Self::InverseAndAxes => {
+                write!(f, "every pose inverted, then its y and z axes reversed (OpenGL's view matrices)")
+            }
+            Self::Focal(scale) => write!(f, "focal lengths times {scale}"),
+            Self::Turn([x, y, z], angle_deg) => {
+                write!(f, "every camera turned by {angle_deg} degrees about its own axis ({x}, {y}, {z})")
+            }
+        }
+    }
 }

@@ -19,13 +19,6 @@ const MAX_TURN_DEG: f64 = 1.0;
 /// Columns and rows of every frame, `None` for an unreadable frame.
 pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
 
-/// Features of a decoded image that the checks use.
-struct SeenImage {
-    size: [usize; 2],
-    hash: u64,
-    features: Option<Features>,
-}
-
 /// Decodes every frame, on all cores. Returns the sizes, and the corners of every `step`-th frame.
 pub(crate) fn check_images(
     source: &dyn SceneSource,
@@ -40,9 +33,9 @@ pub(crate) fn check_images(
         let mut hasher = DefaultHasher::new();
         image.rgb.hash(&mut hasher);
         let features = frame.is_multiple_of(step).then(|| Features::detect(&image));
-        Ok(SeenImage { size: [image.width, image.height], hash: hasher.finish(), features })
+        Ok(([image.width, image.height], hasher.finish(), features))
     });
-    let read: Vec<Result<SeenImage, DataError>> = read.collect();
+    let read: Vec<Result<_, DataError>> = read.collect();
     let failures: Vec<(usize, String)> =
         read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
     if let Some((_, first)) = failures.first() {
@@ -50,7 +43,7 @@ pub(crate) fn check_images(
         let frames = check.list_frames(&frames);
         check.reasons.push(format!("{frames} cannot be read; the first: {first}"));
     }
-    let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.size)).collect();
+    let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.0)).collect();
     let mut counts: BTreeMap<[usize; 2], usize> = BTreeMap::new();
     sizes.iter().flatten().for_each(|size| *counts.entry(*size).or_default() += 1);
     check.image_size = counts.iter().max_by_key(|(_, count)| **count).map(|(size, _)| *size);
@@ -59,13 +52,14 @@ pub(crate) fn check_images(
             counts.iter().map(|([width, height], count)| format!("{width}x{height} ({count})")).collect();
         check.notes.push(format!("frames have {} sizes: {}", counts.len(), list.join(", ")));
     }
-    let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.hash)).collect();
+    let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.1)).collect();
     check_repeated_images(&hashes, cameras, check);
-    (sizes, read.into_iter().step_by(step).map(|read| read.ok()?.features).collect())
+    (sizes, read.into_iter().step_by(step).map(|read| read.ok()?.2).collect())
 }
 
 fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera<IntrinsicsNorm>], check: &mut SceneCheck) {
-    let extent = extent(cameras);
+    let distance = |a: usize, b: usize| cameras[a].c2w.translation.distance(cameras[b].c2w.translation);
+    let extent = (0..cameras.len()).map(|frame| distance(0, frame)).fold(0.0, f64::max);
     let mut seen: HashMap<u64, usize> = HashMap::new();
     let (mut equal, mut contradictions) = (Vec::new(), Vec::new());
     for (frame, hash) in hashes.iter().enumerate() {
@@ -74,8 +68,8 @@ fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera<IntrinsicsNor
             seen.insert(*hash, frame);
             continue;
         };
-        let (distance, turn_deg) = camera_distance(&cameras[first], &cameras[frame]);
-        let is_moved = distance > MAX_MOVE * extent || turn_deg > MAX_TURN_DEG;
+        let turn_deg = cameras[first].c2w.angle_to(cameras[frame].c2w).to_degrees();
+        let is_moved = distance(first, frame) > MAX_MOVE * extent || turn_deg > MAX_TURN_DEG;
         (if is_moved { &mut contradictions } else { &mut equal }).push(frame);
     }
     if !contradictions.is_empty() {
@@ -86,14 +80,4 @@ fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera<IntrinsicsNor
         let frames = check.list_frames(&equal);
         check.notes.push(format!("{frames} repeat the image and the camera of an earlier frame"));
     }
-}
-
-/// Returns the distance of the centres, and the angle between the orientations in degrees.
-fn camera_distance(a: &Camera<IntrinsicsNorm>, b: &Camera<IntrinsicsNorm>) -> (f64, f64) {
-    (a.c2w.translation.distance(b.c2w.translation), a.c2w.angle_to(b.c2w).to_degrees())
-}
-
-/// Returns the largest distance of a camera centre from the first.
-fn extent(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
-    cameras.iter().map(|camera| camera_distance(&cameras[0], camera).0).fold(0.0, f64::max)
 }

@@ -17,7 +17,6 @@ const NUM_NEAREST: usize = 3;
 
 /// Two frames with their matches, at least 20.
 pub(crate) struct FramePair {
-    /// Positions of the frames, in order.
     pub frames: [usize; 2],
     pub matches: Vec<Correspondence>,
 }
@@ -40,7 +39,6 @@ pub(crate) fn match_frames(features: &[Option<Features>], cameras: &[Camera<Intr
     pairs
 }
 
-/// Returns the frames of the pairs, by gap.
 fn pairs_in_order(num_frames: usize) -> Vec<[usize; 2]> {
     let gaps: Vec<usize> = if num_frames <= MAX_ALL_PAIRS {
         (1..num_frames).collect()
@@ -56,18 +54,15 @@ fn pairs_in_order(num_frames: usize) -> Vec<[usize; 2]> {
     gaps.into_iter().flat_map(of_gap).collect()
 }
 
-/// Returns the pairs of a frame with the frames of the most similar cameras.
 fn nearest_pairs(cameras: &[Camera<IntrinsicsNorm>], frame: usize) -> impl Iterator<Item = [usize; 2]> {
     let mut others: Vec<usize> = (0..cameras.len()).filter(|other| *other != frame).collect();
-    let away = |other: &usize| dissimilarity(&cameras[frame], &cameras[*other]);
+    // The distance of the centres plus three times the distance of the forward directions.
+    let away = |other: &usize| {
+        let (a, b) = (cameras[frame].c2w, cameras[*other].c2w);
+        a.translation.distance(b.translation) + 3.0 * a.rotation.z_axis.distance(b.rotation.z_axis)
+    };
     others.sort_by(|a, b| away(a).total_cmp(&away(b)));
     others.into_iter().take(NUM_NEAREST).map(move |other| [frame.min(other), frame.max(other)])
-}
-
-/// Returns the distance of the centres plus three times the distance of the forward directions.
-fn dissimilarity(a: &Camera<IntrinsicsNorm>, b: &Camera<IntrinsicsNorm>) -> f64 {
-    let forward = a.c2w.rotation.z_axis.distance(b.c2w.rotation.z_axis);
-    a.c2w.translation.distance(b.c2w.translation) + 3.0 * forward
 }
 
 /// Matches the corners of two frames. Returns `None` if too few match, and for cameras with one centre, which have no

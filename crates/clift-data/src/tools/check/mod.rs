@@ -4,20 +4,14 @@
 //! - `cameras`: plausible intrinsics and poses
 //! - `images`: readable, equal-sized, distinct images
 //! - `matches`: corners matched between frames
-//! - `triplets`: corners seen in three frames
-//! - `mistakes`: cameras changed by the usual mistakes
 //! - `frames`: each frame against the others
-//! - `epipolar`: poses against matched corners
-//! - `drawing`: two frames with epipolar lines
+//! - `epipolar`: poses against matched corners, the usual mistakes in cameras
 //! - `scene`: check one scene
 
 pub(crate) mod cameras;
-pub(crate) mod drawing;
 pub(crate) mod epipolar;
 pub(crate) mod frames;
 pub(crate) mod images;
 pub(crate) mod matches;
-pub(crate) mod mistakes;
 pub(crate) mod result;
 pub(crate) mod scene;
-pub(crate) mod triplets;

@@ -54,7 +54,6 @@ pub struct SceneCheck {
     pub frame_names: Vec<String>,
 }
 
-/// Most frames listed in a finding.
 const MAX_NAMED: usize = 5;
 
 impl SceneCheck {
@@ -70,7 +69,6 @@ impl SceneCheck {
         format!("{} ({}{more})", plural(frames.len(), "frame"), list.join(", "))
     }
 
-    /// Sets the verdict from the findings.
     pub(crate) fn judge(&mut self) {
         self.verdict = match (self.reasons.is_empty(), self.epipolar_px) {
             (false, _) => Verdict::Flagged,
@@ -97,6 +95,6 @@ pub struct FrameCheck {
     /// Position of the frame.
     pub frame: usize,
     /// Distance of its corners from where two other frames place them, in pixels of an image 640 columns wide: the median
-    /// over the corners, and the lower quartile over at most six choices of the two: in a repeating pattern some are wrong.
+    /// over the corners, and the lower quartile over at most six choices of the two.
     pub reprojection_px: f64,
 }

@@ -2,39 +2,26 @@
 
 use std::collections::BTreeMap;
 
-use clift_core::RgbImage;
-
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, plural};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
-use crate::tools::check::epipolar::Compared;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::check::{cameras, epipolar, images};
 
 /// Largest number of frames whose poses are compared with the images, evenly spaced: the corners of a frame take 0.4 MB.
 const MAX_COMPARED: usize = 500;
 
-/// Results of one scene, with an image for inspection.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CheckedScene {
-    /// Results of the checks.
-    pub check: SceneCheck,
-    /// Two frames with epipolar lines, `None` if too few corners match. Dots of one colour are the same corner in both
-    /// frames and must lie on the lines of the same colour.
-    pub image: Option<RgbImage>,
-}
-
 /// Checks one scene of `source`. Every failure is a reason in the result.
 ///
 /// Decodes all frames, and compares each with about eight others, on all cores.
-pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
+pub fn check_scene(source: &dyn SceneSource, scene: usize) -> SceneCheck {
     let mut check = SceneCheck { key: source.key(scene).to_owned(), ..SceneCheck::default() };
     let cameras = match source.cameras(scene) {
         Ok(cameras) => cameras,
         Err(error) => {
             check.reasons.push(error.to_string());
             check.judge();
-            return CheckedScene { check, image: None };
+            return check;
         }
     };
     check.num_frames = cameras.len();
@@ -46,14 +33,9 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
     }
     let (sizes, features) = images::check_images(source, scene, &cameras, step, &mut check);
     cameras::check_cameras(&cameras, &sizes, &mut check);
-    let image = epipolar::check_poses(
-        source,
-        scene,
-        &Compared { step, cameras: &cameras, sizes: &sizes, features },
-        &mut check,
-    );
+    epipolar::check_poses(&cameras, &sizes, step, &features, &mut check);
     check.judge();
-    CheckedScene { check, image }
+    check
 }
 
 /// Returns results for the scenes skipped when the source was opened, except those reserved for testing.

@@ -1,10 +1,9 @@
-//! Shi-Tomasi corners: positions where the image changes in every direction.
+//! Gray images in f32, and their Shi-Tomasi corners: positions where the image changes in every direction.
 
-use crate::tools::features::gray_image::GrayImage;
+use clift_core::RgbImage;
 
 /// Half the side of the window of summed gradients, in pixels.
 const REACH: usize = 2;
-/// Smallest distance between corners, in pixels.
 const APART: usize = 4;
 /// Smallest distance from the edge, in pixels: nearer corners have no descriptor.
 const MARGIN: usize = 12;
@@ -101,31 +100,49 @@ fn measure(gray: &GrayImage) -> Vec<f32> {
     measure
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use clift_core::RgbImage;
+/// Brightness in `[0, 255]`, row-major.
+pub(crate) struct GrayImage {
+    pub width: usize,
+    pub height: usize,
+    pub values: Vec<f32>,
+}
 
-    #[test]
-    fn corners_of_a_square_are_found_without_its_edges() {
-        let (width, height) = (80, 60);
-        let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
-        let rgb =
-            (0..height).flat_map(|y| (0..width).flat_map(move |x| [if inside(x, y) { 200 } else { 50 }; 3])).collect();
-        let found = find_corners(&GrayImage::new(&RgbImage { width, height, rgb }).blurred(), 100);
-        assert_eq!(found.len(), 4, "{found:?}");
-        for corner in [[20.0, 15.0], [50.0, 15.0], [20.0, 40.0], [50.0, 40.0]] {
-            // The blur moves corners inwards.
-            let near = |found: &[f64; 2]| (0..2).all(|i| (found[i] - corner[i]).abs() < 2.0);
-            assert!(found.iter().any(near), "{found:?} {corner:?}");
-        }
-        assert_eq!(find_corners(&GrayImage::new(&RgbImage { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
+impl GrayImage {
+    /// Converts an image to gray: the mean of the channels with green counted twice.
+    pub fn new(image: &RgbImage) -> Self {
+        let gray = |[r, g, b]: &[u8; 3]| f32::from(u16::from(*r) + 2 * u16::from(*g) + u16::from(*b)) / 4.0;
+        let values = image.rgb.as_chunks::<3>().0.iter().map(gray).collect();
+        Self { width: image.width, height: image.height, values }
     }
 
-    #[test]
-    fn parabola_peak_lies_between_samples() {
-        let at = |x: f64| (5.0 - (x - 0.3) * (x - 0.3)) as f32;
-        assert!((parabola_peak(at(-1.0), at(0.0), at(1.0)) - 0.3).abs() < 1e-6);
-        assert_eq!(parabola_peak(1.0, 1.0, 1.0), 0.0);
+    /// Smooths the image with a binomial filter (1 4 6 4 1), about a Gaussian of one pixel.
+    pub fn blurred(&self) -> Self {
+        let Self { width, height, values } = self;
+        let (width, height) = (*width, *height);
+        let at = |position: usize, offset: usize, size: usize| (position + offset).saturating_sub(2).min(size - 1);
+        let weights = [1.0, 4.0, 6.0, 4.0, 1.0_f32].map(|weight| weight / 16.0);
+        let mut across = Vec::with_capacity(values.len());
+        for row in values.chunks_exact(width) {
+            across.extend((0..width).map(|x| {
+                weights.iter().enumerate().map(|(offset, weight)| row[at(x, offset, width)] * weight).sum::<f32>()
+            }));
+        }
+        let mut blurred = vec![0.0; values.len()];
+        for (y, line) in blurred.chunks_exact_mut(width).enumerate() {
+            for (offset, weight) in weights.iter().enumerate() {
+                let from = at(y, offset, height) * width;
+                for (sum, value) in line.iter_mut().zip(&across[from..from + width]) {
+                    *sum += value * weight;
+                }
+            }
+        }
+        Self { width, height, values: blurred }
+    }
+
+    /// Returns half the difference of the horizontal and of the vertical neighbours of a pixel off the edge.
+    pub fn gradient(&self, x: usize, y: usize) -> [f32; 2] {
+        let at = y * self.width + x;
+        let v = &self.values;
+        [(v[at + 1] - v[at - 1]) / 2.0, (v[at + self.width] - v[at - self.width]) / 2.0]
     }
 }

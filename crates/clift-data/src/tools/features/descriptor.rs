@@ -1,12 +1,9 @@
-//! Descriptors of corners: upright histograms of gradient directions in 4 x 4 cells, as in SIFT.
+//! Descriptors of corners: upright histograms of gradient directions in 4 x 4 cells, as in SIFT, and mutual nearest ones.
 
-use crate::tools::features::gray_image::GrayImage;
+use crate::tools::features::corners::GrayImage;
 
-/// Cells along a side.
 const CELLS: usize = 4;
-/// Directions per cell.
 const DIRECTIONS: usize = 8;
-/// Side of a cell in pixels.
 const CELL_PX: f32 = 5.0;
 /// Largest component relative to the length. Clipping keeps one strong edge from dominating.
 const MAX_COMPONENT: f32 = 0.2;
@@ -17,7 +14,6 @@ const LENGTH: f32 = 1024.0;
 #[derive(Clone, Debug)]
 pub(crate) struct Descriptor {
     values: [i16; CELLS * CELLS * DIRECTIONS],
-    /// Squared length.
     square: i32,
 }
 
@@ -80,38 +76,48 @@ fn add(sums: &mut [f32], [across, down, turn]: [f32; 3], strength: f32) {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use clift_core::RgbImage;
+/// Largest distance of the nearest descriptor over that of the second nearest (Lowe's ratio test).
+const RATIO: f64 = 0.8;
 
-    fn waves(shift: f64, contrast: f64) -> GrayImage {
-        let (width, height) = (64, 64);
-        let value = |x: usize, y: usize| {
-            let (x, y) = (x as f64 - shift, y as f64);
-            (127.0 + contrast * ((x * 0.4).sin() + (y * 0.3 + x * 0.1).cos())) as u8
-        };
-        let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [value(x, y); 3])).collect();
-        GrayImage::new(&RgbImage { width, height, rgb }).blurred()
+/// Returns the pairs of mutual nearest descriptors that pass the ratio test both ways, in the order of the first list.
+pub(crate) fn match_mutually(first: &[Descriptor], second: &[Descriptor]) -> Vec<(usize, usize)> {
+    let mut forward = vec![Nearest::NONE; first.len()];
+    let mut backward = vec![Nearest::NONE; second.len()];
+    for (a, mine) in first.iter().enumerate() {
+        for (b, other) in second.iter().enumerate() {
+            let distance = mine.squared_distance(other);
+            forward[a].update(b, distance);
+            backward[b].update(a, distance);
+        }
     }
+    let clear = |nearest: &Nearest| nearest.is_clear().then_some(nearest.index);
+    let pair = |(a, nearest): (usize, &Nearest)| {
+        let b = clear(nearest)?;
+        (clear(&backward[b]) == Some(a)).then_some((a, b))
+    };
+    forward.iter().enumerate().filter_map(pair).collect()
+}
 
-    #[test]
-    fn descriptor_moves_with_the_image_and_ignores_contrast() {
-        let here = Descriptor::at(&waves(0.0, 60.0), 30.5, 30.5).unwrap();
-        let moved = Descriptor::at(&waves(3.0, 60.0), 33.5, 30.5).unwrap();
-        let faint = Descriptor::at(&waves(0.0, 30.0), 30.5, 30.5).unwrap();
-        let elsewhere = Descriptor::at(&waves(0.0, 60.0), 38.5, 25.5).unwrap();
-        assert_eq!(here.squared_distance(&here), 0);
-        let far = here.squared_distance(&elsewhere);
-        for same in [moved, faint] {
-            assert!(here.squared_distance(&same) * 20 < far, "{} {far}", here.squared_distance(&same));
+/// The nearest descriptor so far, its distance, and the distance of the second nearest.
+#[derive(Clone, Copy)]
+struct Nearest {
+    index: usize,
+    distance: i32,
+    second: i32,
+}
+
+impl Nearest {
+    const NONE: Self = Self { index: usize::MAX, distance: i32::MAX, second: i32::MAX };
+
+    fn update(&mut self, index: usize, distance: i32) {
+        if distance < self.distance {
+            *self = Self { index, distance, second: self.distance };
+        } else {
+            self.second = self.second.min(distance);
         }
     }
 
-    #[test]
-    fn edges_and_plain_walls_have_no_descriptor() {
-        assert!(Descriptor::at(&waves(0.0, 60.0), 8.0, 30.0).is_none());
-        let plain = GrayImage { width: 64, height: 64, values: vec![7.0; 64 * 64] };
-        assert!(Descriptor::at(&plain, 30.0, 30.0).is_none());
+    fn is_clear(&self) -> bool {
+        self.index != usize::MAX && f64::from(self.distance) < RATIO * RATIO * f64::from(self.second)
     }
 }

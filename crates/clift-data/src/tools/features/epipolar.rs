@@ -1,6 +1,6 @@
-//! Epipolar lines, and fundamental matrices of matched corners by RANSAC.
+//! Cameras in the pixels of matched corners, epipolar lines, and fundamental matrices of matched corners by RANSAC.
 
-use clift_core::{step_rng, uniform_below};
+use clift_core::{Camera, IntrinsicsNorm, Pose, step_rng, uniform_below};
 use glam::{DMat3, DVec3};
 
 /// Number of columns to which wider images are reduced. Distances are in pixels of this width.
@@ -9,15 +9,12 @@ pub const WIDTH: usize = 640;
 /// Two corners that show the same point, in pixels of an image [`WIDTH`] columns wide.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Correspondence {
-    /// Column and row in the first image.
     pub first: [f64; 2],
-    /// Column and row in the second image.
     pub second: [f64; 2],
 }
 
 /// Largest distance of an inlier from its epipolar lines, in pixels.
 const MAX_INLIER_PX: f64 = 1.5;
-/// Largest number of samples of eight matches.
 const MAX_TRIES: u64 = 3000;
 /// Probability of no all-inlier sample at which the search ends.
 const MAX_FAILURE: f64 = 1e-4;
@@ -28,22 +25,17 @@ const MIN_INLIER_SHARE: f64 = 0.25;
 
 /// Returns the epipolar line `a x + b y + c = 0` in the second image of a point in the first, as `(a, b, c)` with unit
 /// normal `(a, b)`; `None` for a point at the epipole.
-pub fn line(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
+fn line(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
     let line = *geometry * DVec3::new(point[0], point[1], 1.0);
     let length = line.x.hypot(line.y);
     (length > 0.0 && length.is_finite()).then(|| line / length)
-}
-
-/// Returns the epipolar line in the first image of a point in the second.
-pub fn line_back(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
-    line(&geometry.transpose(), point)
 }
 
 /// Returns the symmetric epipolar distance in pixels: the mean distance of each point to the line of the other.
 pub fn epipolar_distance(geometry: &DMat3, pair: &Correspondence) -> f64 {
     let away = |line: Option<DVec3>, [x, y]: [f64; 2]| line.map_or(0.0, |line| line.dot(DVec3::new(x, y, 1.0)).abs());
     let in_second = away(line(geometry, pair.first), pair.second);
-    let in_first = away(line_back(geometry, pair.second), pair.first);
+    let in_first = away(line(&geometry.transpose(), pair.second), pair.first);
     f64::midpoint(in_second, in_first)
 }
 
@@ -123,72 +115,53 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
     vector
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::tools::features::pixel_camera::PixelCamera;
-    use clift_core::{Camera, IntrinsicsNorm, Pose, uniform_01};
+/// A camera of an image [`WIDTH`] columns wide, whose height keeps the shape of the pixels.
+#[derive(Clone, Copy)]
+pub(crate) struct PixelCamera {
+    intrinsics: DMat3,
+    inverse_intrinsics: DMat3,
+    pub c2w: Pose,
+}
 
-    /// Returns two overlapping cameras, and points that both see.
-    fn scene(num_points: u64) -> ([Camera<IntrinsicsNorm>; 2], Vec<Correspondence>) {
-        let intrinsics_norm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.48 };
-        let second = Pose { rotation: DMat3::from_rotation_y(0.2), translation: DVec3::new(-0.7, 0.2, 0.1) };
-        let cameras = [Pose::IDENTITY, second].map(|c2w| Camera { intrinsics: intrinsics_norm, c2w });
-        let seen = |camera: &Camera<IntrinsicsNorm>, point: DVec3| {
-            let [x, y, z] = camera.c2w.inverse().apply(point).to_array();
-            let k = camera.intrinsics.to_pixels(640, 480);
-            [k.fx * x / z + k.cx, k.fy * y / z + k.cy]
-        };
-        let matches = (0..num_points).map(|i| {
-            let mut rng = step_rng(5, i, "test");
-            let point = DVec3::new(
-                2.0 * uniform_01(&mut rng) - 1.0,
-                1.5 * uniform_01(&mut rng) - 0.7,
-                3.0 + 2.0 * uniform_01(&mut rng),
-            );
-            Correspondence { first: seen(&cameras[0], point), second: seen(&cameras[1], point) }
-        });
-        (cameras, matches.collect())
+impl PixelCamera {
+    pub fn new(camera: &Camera<IntrinsicsNorm>, [columns, rows]: [usize; 2]) -> Self {
+        let k = camera.intrinsics;
+        let (width, height) = (WIDTH as f64, WIDTH as f64 * rows as f64 / columns as f64);
+        let rows = [k.fx * width, 0.0, k.cx * width, 0.0, k.fy * height, k.cy * height, 0.0, 0.0, 1.0];
+        Self::with_intrinsics(DMat3::from_rows_array(&rows), camera.c2w)
     }
 
-    #[test]
-    fn points_of_both_cameras_lie_on_epipolar_lines() {
-        let (cameras, matches) = scene(50);
-        let cameras = [PixelCamera::new(&cameras[0], [320, 240]), PixelCamera::new(&cameras[1], [1280, 960])];
-        let geometry = PixelCamera::fundamental(&cameras[0], &cameras[1]);
-        for pair in &matches {
-            assert!(epipolar_distance(&geometry, pair) < 1e-9, "{pair:?}");
-            let line = line(&geometry, pair.first).unwrap();
-            let beside = DVec3::new(pair.second[0] + 3.0 * line.x, pair.second[1] + 3.0 * line.y, 1.0);
-            assert!((line.dot(beside) - 3.0).abs() < 1e-9);
-        }
+    fn with_intrinsics(intrinsics: DMat3, c2w: Pose) -> Self {
+        Self { intrinsics, inverse_intrinsics: intrinsics.inverse(), c2w }
     }
 
-    #[test]
-    fn eight_matches_determine_the_geometry() {
-        let (_, matches) = scene(60);
-        let geometry = eight_point(&std::array::from_fn(|i| matches[i]));
-        for pair in &matches {
-            assert!(epipolar_distance(&geometry, pair) < 1e-6, "{}", epipolar_distance(&geometry, pair));
-        }
+    pub fn with_focal_scale(&self, scale: f64) -> Self {
+        let scaled = DMat3::from_diagonal(DVec3::new(scale, scale, 1.0));
+        let centre = self.intrinsics.z_axis;
+        let mut intrinsics = self.intrinsics * scaled;
+        intrinsics.z_axis = centre;
+        Self::with_intrinsics(intrinsics, self.c2w)
     }
 
-    #[test]
-    fn ransac_rejects_wrong_matches() {
-        let (_, mut matches) = scene(120);
-        for (i, pair) in matches.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
-            let mut rng = step_rng(6, i as u64, "test");
-            pair.second = [640.0 * uniform_01(&mut rng), 480.0 * uniform_01(&mut rng)];
-        }
-        let kept = ransac_inliers(&matches);
-        let right = matches.iter().enumerate().filter(|(i, _)| i % 3 != 0).map(|(_, pair)| *pair);
-        assert!(right.clone().all(|pair| kept.contains(&pair)));
-        assert!(kept.len() < 80 + 8, "{}", kept.len());
-        for (i, pair) in matches.iter_mut().enumerate() {
-            let mut rng = step_rng(7, i as u64, "test");
-            pair.second = [640.0 * uniform_01(&mut rng), 480.0 * uniform_01(&mut rng)];
-        }
-        assert!(ransac_inliers(&matches).is_empty());
-        assert!(ransac_inliers(&matches[..19]).is_empty());
+    pub fn ray(&self, [x, y]: [f64; 2]) -> DVec3 {
+        self.c2w.rotation * (self.inverse_intrinsics * DVec3::new(x, y, 1.0))
+    }
+
+    /// Returns the homogeneous pixel of a point of the world.
+    pub fn project(&self, point: DVec3) -> DVec3 {
+        self.project_direction(point - self.c2w.translation)
+    }
+
+    /// Returns the homogeneous pixel of a direction of the world.
+    pub fn project_direction(&self, direction: DVec3) -> DVec3 {
+        self.intrinsics * (self.c2w.rotation.transpose() * direction)
+    }
+
+    /// Returns the fundamental matrix of two cameras: `second^T F first = 0` for a point seen at `first` and `second`.
+    pub fn fundamental(first: &Self, second: &Self) -> DMat3 {
+        let Pose { rotation, translation: t } = second.c2w.inverse().after(first.c2w);
+        // E = [t]x R, column by column.
+        let essential = DMat3::from_cols(t.cross(rotation.x_axis), t.cross(rotation.y_axis), t.cross(rotation.z_axis));
+        second.inverse_intrinsics.transpose() * essential * first.inverse_intrinsics
     }
 }

@@ -6,13 +6,10 @@
 use clift_core::RgbImage;
 
 use crate::image::lanczos::resize_lanczos;
-use crate::tools::features::corners::find_corners;
-use crate::tools::features::descriptor::Descriptor;
+use crate::tools::features::corners::{GrayImage, find_corners};
+use crate::tools::features::descriptor::{Descriptor, match_mutually};
 use crate::tools::features::epipolar::{Correspondence, WIDTH, ransac_inliers};
-use crate::tools::features::gray_image::GrayImage;
-use crate::tools::features::matching::match_mutually;
 
-/// Largest numbers of corners of the two sizes of an image.
 const MAX_CORNERS: [usize; 2] = [900, 500];
 /// Size of the smaller image over the larger. Its corners match surfaces that the other image shows from farther away.
 const SMALLER: f64 = 0.6;
@@ -62,16 +59,4 @@ pub fn reduced(image: &RgbImage) -> RgbImage {
     }
     let height = (image.height as f64 * WIDTH as f64 / image.width as f64).round().max(1.0) as usize;
     resize_lanczos(image, WIDTH, height)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn images_of_one_colour_have_no_corners() {
-        let features = Features::detect(&RgbImage { width: 64, height: 48, rgb: vec![90; 64 * 48 * 3] });
-        assert!(features.points.is_empty() && features.matches(&features).is_empty());
-        assert!(Features::detect(&RgbImage { width: 3, height: 2, rgb: vec![9; 18] }).points.is_empty());
-    }
 }

@@ -3,13 +3,14 @@
 use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
+use clift_kernels::HeadTransform;
 
 use crate::network::blocks::norms::QkNorm;
-use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::tokens::Tokens;
 use crate::ops::attention::{cross_sdpa, self_sdpa};
+use crate::ops::head_transform::{KEY_VALUE, OUTPUT, QUERY, QUERY_KEY_VALUE, transform_heads};
 use crate::ops::linear::{linear, norm_linear};
 
 /// Self-attention with a packed projection (paper section 3.1: eight heads).
@@ -23,7 +24,6 @@ pub struct SelfAttention {
 }
 
 impl SelfAttention {
-    /// Makes the layer with PyTorch's initialization of multi-head attention.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         let ModelConfig { dim, num_heads, .. } = *config;
         Self {
@@ -35,23 +35,12 @@ impl SelfAttention {
     }
 
     /// Applies `norm`, then attention among the tokens of a scene.
-    ///
-    /// # Shapes
-    /// - `x` and the result: `[batch, count, dim]`
-    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
+    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>, transforms: Option<&Tensor<3>>) -> Tensor<3> {
         let packed = norm_linear(norm, &self.in_proj, x);
-        let packed = match &self.qk_norm {
-            Some(qk_norm) => qk_norm.query_key_value(packed),
-            None => packed,
-        };
-        let attended = match transforms {
-            Some(transforms) => {
-                let packed = transforms.query_key_value(packed, self.num_heads);
-                transforms.output(self_sdpa(packed, self.num_heads), self.num_heads)
-            }
-            None => self_sdpa(packed, self.num_heads),
-        };
-        linear(&self.out_proj, attended)
+        let packed = apply(self.qk_norm.as_ref(), packed, QkNorm::query_key_value);
+        let packed = transform(packed, transforms, QUERY_KEY_VALUE, self.num_heads);
+        let attended = self_sdpa(packed, self.num_heads);
+        linear(&self.out_proj, transform(attended, transforms, OUTPUT, self.num_heads))
     }
 
     /// Applies `norm`, then attention of the first `count` tokens of a scene to all of them.
@@ -63,11 +52,8 @@ impl SelfAttention {
         let [_, _, dim] = x.dims();
         let packed = norm_linear(norm, &self.in_proj, x);
         let query = packed.clone().narrow(1, 0, count).narrow(2, 0, dim);
-        let key_value = packed.narrow(2, dim, 2 * dim);
-        let (query, key_value) = match &self.qk_norm {
-            Some(qk_norm) => (qk_norm.query(query), qk_norm.key_value(key_value)),
-            None => (query, key_value),
-        };
+        let query = apply(self.qk_norm.as_ref(), query, QkNorm::query);
+        let key_value = apply(self.qk_norm.as_ref(), packed.narrow(2, dim, 2 * dim), QkNorm::key_value);
         linear(&self.out_proj, cross_sdpa(query, key_value, self.num_heads))
     }
 }
@@ -84,7 +70,6 @@ pub struct CrossAttention {
 }
 
 impl CrossAttention {
-    /// Makes the layer with PyTorch's initialization of multi-head attention.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         let ModelConfig { dim, num_heads, .. } = *config;
         Self {
@@ -101,39 +86,21 @@ impl CrossAttention {
         &self,
         norm: Option<&LayerNorm>,
         x: Tensor<3>,
-        transforms: Option<&TokenTransforms>,
+        transforms: Option<&Tensor<3>>,
     ) -> Tensor<3> {
-        let query = project(norm, &self.q_proj, x);
-        let query = match &self.qk_norm {
-            Some(qk_norm) => qk_norm.query(query),
-            None => query,
-        };
-        match transforms {
-            Some(transforms) => transforms.query(query, self.num_heads),
-            None => query,
-        }
+        let query = apply(self.qk_norm.as_ref(), project(norm, &self.q_proj, x), QkNorm::query);
+        transform(query, transforms, QUERY, self.num_heads)
     }
 
     /// Projects tokens to keys and values side by side, `[batch, num_keys, 2 dim]`.
     pub(crate) fn project_key_value(&self, norm: Option<&LayerNorm>, tokens: Tokens) -> Tensor<3> {
         let key_value = project(norm, &self.kv_proj, tokens.values);
-        let key_value = match &self.qk_norm {
-            Some(qk_norm) => qk_norm.key_value(key_value),
-            None => key_value,
-        };
-        match tokens.transforms {
-            Some(transforms) => transforms.key_value(key_value, self.num_heads),
-            None => key_value,
-        }
+        let key_value = apply(self.qk_norm.as_ref(), key_value, QkNorm::key_value);
+        transform(key_value, tokens.transforms.as_ref(), KEY_VALUE, self.num_heads)
     }
 
-    /// Projects the concatenated heads of the queries.
-    pub(crate) fn project_out(&self, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
-        let x = match transforms {
-            Some(transforms) => transforms.output(x, self.num_heads),
-            None => x,
-        };
-        linear(&self.out_proj, x)
+    pub(crate) fn project_out(&self, x: Tensor<3>, transforms: Option<&Tensor<3>>) -> Tensor<3> {
+        linear(&self.out_proj, transform(x, transforms, OUTPUT, self.num_heads))
     }
 
     pub(crate) fn num_heads(&self) -> usize {
@@ -146,4 +113,21 @@ fn project(norm: Option<&LayerNorm>, layer: &Linear, x: Tensor<3>) -> Tensor<3> 
         Some(norm) => norm_linear(norm, layer, x),
         None => linear(layer, x),
     }
+}
+
+fn apply<T>(module: Option<&T>, x: Tensor<3>, f: impl Fn(&T, Tensor<3>) -> Tensor<3>) -> Tensor<3> {
+    match module {
+        Some(module) => f(module, x),
+        None => x,
+    }
+}
+
+/// Transforms the heads of tokens in camera-relative attention.
+fn transform(
+    x: Tensor<3>,
+    transforms: Option<&Tensor<3>>,
+    parts: &'static [HeadTransform],
+    num_heads: usize,
+) -> Tensor<3> {
+    apply(transforms, x, |transforms, x| transform_heads(x, transforms.clone(), parts, num_heads))
 }

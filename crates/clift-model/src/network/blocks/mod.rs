@@ -1,5 +1,6 @@
 //! Layers of the networks: `norms` of tokens, queries and keys; `attention` and `feed_forward` layers; and in `block` the
 //! pre-norm encoder and decoder blocks that are made of them. `pixels` embeds patches and decodes images.
+//! Tokens `x` and results are `[batch, count, dim]` unless a function says otherwise.
 
 pub(crate) mod attention;
 pub(crate) mod block;

@@ -16,15 +16,10 @@ pub struct LiftNorm {
 }
 
 impl LiftNorm {
-    /// Makes the norm of tokens of the width of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self { norm: init.layer_norm(config.dim) }
     }
 
-    /// Returns the tokens that K-means, condenser and renderer read.
-    ///
-    /// # Shapes
-    /// - `lift` and the result: `[batch, num_tokens, dim]`
     pub fn forward(&self, lift: Tensor<3>) -> Tensor<3> {
         self.norm.forward(lift)
     }
@@ -41,7 +36,7 @@ pub struct QkNorm {
 impl QkNorm {
     /// Makes the norms of an attention layer; `None` in networks without them.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Option<Self> {
-        init.has_query_key_norms().then(|| {
+        config.has_query_key_norms().then(|| {
             let head_width = config.dim / config.num_heads;
             Self { query: init.rms_norm(head_width), key: init.rms_norm(head_width) }
         })

@@ -14,13 +14,11 @@ pub(crate) fn cube_tensor<const D: usize>(x: &Tensor<D>) -> Option<CubeTensor> {
     }
 }
 
-/// Returns a tensor without autodiff.
 pub(crate) fn float_tensor<const D: usize>(x: CubeTensor) -> Tensor<D> {
     let kind = DispatchTensorKind::Cube(BackendTensor::Float(x));
     Tensor::from_dispatch(DispatchTensor { kind, autodiff: DispatchAutodiffContext::default() })
 }
 
-/// Returns whether the kernels accept the tensor: f64 and f16 take the composed operations.
 pub(crate) fn is_native(x: &CubeTensor) -> bool {
     x.dtype == DType::F32 && x.qparams.is_none()
 }
@@ -32,17 +30,24 @@ pub(crate) fn is_operand(x: &CubeTensor) -> bool {
     is_native(x) || x.dtype == DType::F16 && x.qparams.is_none()
 }
 
+/// Returns the type of values; indices are words of 32 bits, too.
 fn values(x: &CubeTensor) -> Values {
-    if x.dtype == DType::F16 { Values::F16 } else { Values::F32 }
+    match x.dtype {
+        DType::F16 => Values::F16,
+        DType::F32 | DType::I32 => Values::F32,
+        other => panic!("the GPU kernels have no {other:?}"),
+    }
 }
 
 /// Returns the values of a tensor in row-major order, copied if they lie otherwise.
+///
+/// # Panics
+/// For types other than f32, f16 and i32.
 pub(crate) fn buffer(x: CubeTensor) -> Buffer {
     let x = into_contiguous(x);
     Buffer { len: x.shape().num_elements(), values: values(&x), handle: x.handle }
 }
 
-/// Returns a tensor on the device of `like`.
 pub(crate) fn tensor(like: &CubeTensor, x: Buffer, shape: impl Into<Shape>) -> CubeTensor {
     let dtype = if x.values == Values::F16 { DType::F16 } else { DType::F32 };
     CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), shape.into(), x.handle, dtype)

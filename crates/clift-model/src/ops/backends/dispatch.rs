@@ -9,7 +9,7 @@ impl crate::ops::kernels::Kernels for burn::backend::NdArray {}
 /// [`Differentiable`](crate::ops::autodiff::Differentiable).
 macro_rules! operations {
     ($(#[$attribute:meta])* pub trait $trait:ident {
-        $(fn $name:ident($($input:ident),+; $($argument:ident: $type:ident $(<$of:tt>)?),+) = $operation:expr;)+
+        $(fn $name:ident($($input:ident),+; $($argument:ident: $type:ident $(<$of:tt>)?),*) = $operation:expr;)+
     }) => {
         $(#[$attribute])*
         #[burn::backend::backend_extension(
@@ -18,14 +18,14 @@ macro_rules! operations {
         pub trait $trait: burn::backend::Backend {
             $(fn $name(
                 $($input: burn::backend::tensor::FloatTensor<Self>,)+
-                $($argument: $type $(<$of>)?),+
+                $($argument: $type $(<$of>)?),*
             ) -> burn::backend::tensor::FloatTensor<Self>;)+
         }
 
         impl<B: $crate::ops::kernels::Kernels> $trait for B {
             $(fn $name(
                 $($input: burn::backend::tensor::FloatTensor<Self>,)+
-                $($argument: $type $(<$of>)?),+
+                $($argument: $type $(<$of>)?),*
             ) -> burn::backend::tensor::FloatTensor<Self> {
                 $crate::ops::autodiff::Differentiable::<Self, _>::forward(&$operation, [$($input),+])
             })+
@@ -38,7 +38,7 @@ macro_rules! operations {
         {
             $(fn $name(
                 $($input: burn::backend::tensor::FloatTensor<Self>,)+
-                $($argument: $type $(<$of>)?),+
+                $($argument: $type $(<$of>)?),*
             ) -> burn::backend::tensor::FloatTensor<Self> {
                 $crate::ops::autodiff::record::<B, C, _, _>($operation, [$($input),+])
             })+

@@ -2,7 +2,6 @@
 //!
 //! - `dispatch`: the list: an operation runs on the backend of its tensors
 //! - `flex`: Burn's CPU backend, by the kernels of `clift-kernels` in f32 and bf16
-//! - `flex_slices`: its tensors as f32 slices
 //! - `cube`: GPUs, by the kernels of `clift-cube`
 //! - `cube_buffers`: its tensors as buffers
 //!
@@ -14,4 +13,3 @@ pub(crate) mod cube;
 pub(crate) mod cube_buffers;
 pub(crate) mod dispatch;
 pub(crate) mod flex;
-pub(crate) mod flex_slices;

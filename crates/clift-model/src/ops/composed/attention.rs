@@ -1,4 +1,5 @@
 //! Attention in chunks of queries, on any backend.
+// B scenes, N tokens, Q queries, K keys, D width, H heads, E width of a head
 
 use std::ops::Range;
 
@@ -8,54 +9,23 @@ use burn::tensor::Shape;
 
 use crate::ops::composed::primitives::{narrow, score_scale};
 
-/// Queries, keys and values, as the projections return them.
-#[derive(Clone, Debug)]
-pub enum Qkv<T> {
-    /// Queries, keys and values side by side: `[B, N, 3D]`.
-    Packed(T),
-    Separate {
-        /// Queries, `[B, Q, D]`.
-        query: T,
-        /// Keys and values side by side: `[B, K, 2D]`.
-        key_value: T,
-    },
+/// Returns for queries, keys and values the input that has them, their place among the parts of its rows, and the number of
+/// these parts. One input has all three side by side, `[B, N, 3D]`; of two the first has queries, `[B, Q, D]`, and the second keys
+/// and values side by side, `[B, K, 2D]`.
+pub(crate) const fn parts<const N: usize>() -> [[usize; 3]; 3] {
+    if N == 1 { [[0, 0, 3], [0, 1, 3], [0, 2, 3]] } else { [[0, 0, 1], [1, 0, 2], [1, 1, 2]] }
 }
 
-impl<T> Qkv<T> {
-    pub(crate) fn map<U>(self, function: impl Fn(T) -> U) -> Qkv<U> {
-        match self {
-            Self::Packed(packed) => Qkv::Packed(function(packed)),
-            Self::Separate { query, key_value } => {
-                Qkv::Separate { query: function(query), key_value: function(key_value) }
-            }
-        }
-    }
-}
-
-/// Results of the forward pass of attention.
-#[derive(Clone, Debug)]
-pub struct AttentionOutput<T> {
-    /// Output, `[B, Q, D]`.
-    pub output: T,
-    /// Logarithm of the sum of every row of scores, `[B, H, Q]`, if the native kernel computed it.
-    pub log_sum: Option<T>,
-}
-
-/// Splits into queries, keys and values, each `[B, N, D]`.
-fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
-    let part = |packed: &FloatTensor<B>, parts: usize, part: usize| {
-        let dim = packed.shape()[2] / parts;
-        narrow::<B>(packed, 2, part * dim..(part + 1) * dim)
-    };
-    match inputs {
-        Qkv::Packed(packed) => [0, 1, 2].map(|i| part(packed, 3, i)),
-        Qkv::Separate { query, key_value } => [query.clone(), part(key_value, 2, 0), part(key_value, 2, 1)],
-    }
+fn split<B: Backend, const N: usize>(inputs: &[FloatTensor<B>; N]) -> [FloatTensor<B>; 3] {
+    parts::<N>().map(|[input, part, parts]| {
+        let dim = inputs[input].shape()[2] / parts;
+        narrow::<B>(&inputs[input], 2, part * dim..(part + 1) * dim)
+    })
 }
 
 /// Most scores in memory at once, over all scenes and heads: 64 MiB in f32. A scene of 4,096 tokens with 8 heads takes 8
 /// chunks of 512 queries.
-pub const MAX_SCORES: usize = 1 << 24;
+pub(crate) const MAX_SCORES: usize = 1 << 24;
 
 /// Divides the queries into ranges of at most [`MAX_SCORES`] scores each.
 pub(crate) fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: usize) -> Vec<Range<usize>> {
@@ -64,12 +34,12 @@ pub(crate) fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, n
 }
 
 /// Computes `softmax(s q k^T) v` per head, a chunk of queries at a time.
-pub(crate) fn forward<B: Backend>(
-    inputs: &Qkv<FloatTensor<B>>,
+pub(crate) fn forward<B: Backend, const N: usize>(
+    inputs: &[FloatTensor<B>; N],
     num_heads: usize,
     matmul: impl Fn(FloatTensor<B>, FloatTensor<B>) -> FloatTensor<B>,
-) -> AttentionOutput<FloatTensor<B>> {
-    let [query, key, value] = split::<B>(inputs);
+) -> FloatTensor<B> {
+    let [query, key, value] = split::<B, N>(inputs);
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let query = split_heads::<B>(B::float_mul_scalar(query, score_scale(dim, num_heads).into()), num_heads);
@@ -79,20 +49,20 @@ pub(crate) fn forward<B: Backend>(
         let scores = matmul(narrow::<B>(&query, 2, range), key_t.clone()); // [B, H, chunk, K]
         matmul(B::softmax(scores, 3), value.clone())
     });
-    AttentionOutput { output: merge_heads::<B>(concat::<B>(chunks.collect())), log_sum: None }
+    merge_heads::<B>(concat::<B>(chunks.collect()))
 }
 
 /// Computes the gradients of the inputs, a chunk of queries at a time.
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`, `dK = s dS^T Q`.
-pub(crate) fn backward<B: Backend>(
-    inputs: &Qkv<FloatTensor<B>>,
+pub(crate) fn backward<B: Backend, const N: usize>(
+    inputs: &[FloatTensor<B>; N],
     output: FloatTensor<B>,
     num_heads: usize,
     grad_output: FloatTensor<B>,
     matmul: impl Fn(FloatTensor<B>, FloatTensor<B>) -> FloatTensor<B>,
-) -> Qkv<FloatTensor<B>> {
-    let [query, key, value] = split::<B>(inputs);
+) -> [FloatTensor<B>; N] {
+    let [query, key, value] = split::<B, N>(inputs);
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let head_width = dim / num_heads;
@@ -129,13 +99,11 @@ pub(crate) fn backward<B: Backend>(
     }
     let (grad_key, grad_value) = grad_key_value.expect("attention has at least one query");
     let grad_query = B::float_mul_scalar(merge_heads::<B>(concat::<B>(grad_query)), scale.into());
-    let (grad_key, grad_value) = (merge_heads::<B>(grad_key), merge_heads::<B>(grad_value));
-    match inputs {
-        Qkv::Packed(_) => Qkv::Packed(B::float_cat(vec![grad_query, grad_key, grad_value], 2)),
-        Qkv::Separate { .. } => {
-            Qkv::Separate { query: grad_query, key_value: B::float_cat(vec![grad_key, grad_value], 2) }
-        }
-    }
+    let grads = [grad_query, merge_heads::<B>(grad_key), merge_heads::<B>(grad_value)];
+    std::array::from_fn(|input| {
+        let own = parts::<N>().into_iter().zip(grads.clone()).filter(|([of, ..], _)| *of == input);
+        concat::<B>(own.map(|(_, grad)| grad).collect())
+    })
 }
 
 /// `[B, N, D] -> [B, H, N, E]`

@@ -7,15 +7,11 @@ use burn::tensor::{FloatDType, Shape};
 
 use crate::ops::composed::primitives::{narrow, score_scale};
 
-/// Inputs of the attention inside clusters.
+/// The segments of members, and the number of heads.
 #[derive(Clone, Debug)]
-pub struct ClusterInputs<B: Backend> {
-    /// Queries of the centroids, `[B, S, D]`.
-    pub(crate) query: FloatTensor<B>,
-    /// Keys and values of the members side by side, `[B, M, 2D]`.
-    pub(crate) key_value: FloatTensor<B>,
+pub struct Clusters<T> {
     /// Segment of every member, `scene * S + cluster`: `[BM]`.
-    pub(crate) segment: IntTensor<B>,
+    pub(crate) segment: T,
     pub(crate) num_heads: usize,
 }
 
@@ -25,9 +21,12 @@ fn split<B: Backend>(key_value: FloatTensor<B>, num_heads: usize) -> [FloatTenso
     [0..width / 2, width / 2..width].map(|columns| flatten::<B>(narrow::<B>(&key_value, 2, columns), num_heads))
 }
 
-/// Computes the output `[B, S, D]` and the weights `[BM, H, 1]`.
-pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>; 2] {
-    let ClusterInputs { query, key_value, segment, num_heads } = inputs.clone();
+/// Computes the output `[B, S, D]` and the weights `[BM, H, 1]` from the queries of the centroids, `[B, S, D]`, and the keys and
+/// values of the members side by side, `[B, M, 2D]`.
+pub(crate) fn forward<B: Backend>(
+    [query, key_value]: [FloatTensor<B>; 2],
+    Clusters { segment, num_heads }: Clusters<IntTensor<B>>,
+) -> [FloatTensor<B>; 2] {
     let [batch, num_segments, dim] = query.shape().dims();
     let segments = batch * num_segments;
     let head_width = dim / num_heads;
@@ -58,11 +57,9 @@ pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>;
 /// Computes the gradients. With `g_i = dO[segment i]`: `dV_i = p_i g_i`, `dS_i = p_i (g_i v_i - rowsum(dO * O)[segment i])`,
 /// `dK_i = s dS_i q[segment i]`, `dQ_s = s sum_i dS_i k_i`.
 pub(crate) fn backward<B: Backend>(
-    inputs: ClusterInputs<B>,
-    [output, weights]: [FloatTensor<B>; 2],
-    grad_output: FloatTensor<B>,
+    [query, key_value, output, weights, grad_output]: [FloatTensor<B>; 5],
+    Clusters { segment, num_heads }: Clusters<IntTensor<B>>,
 ) -> [FloatTensor<B>; 2] {
-    let ClusterInputs { query, key_value, segment, num_heads } = inputs;
     let query_shape = query.shape();
     let [_, num_members, _]: [usize; 3] = key_value.shape().dims();
     let [batch, num_segments, dim]: [usize; 3] = query_shape.dims();

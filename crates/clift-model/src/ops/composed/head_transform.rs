@@ -8,28 +8,13 @@ use clift_kernels::{HeadTransform, transform_len};
 
 use crate::ops::composed::primitives::narrow;
 
-/// Parts of a row with their transforms, and the number of heads of each part.
-#[derive(Clone, Copy, Debug)]
-pub struct Heads {
-    pub(crate) parts: &'static [HeadTransform],
-    pub(crate) num_heads: usize,
-}
-
-impl Heads {
-    /// Returns the transforms of the parts, transposed for the gradient.
-    pub(crate) fn kinds(self, is_gradient: bool) -> Vec<HeadTransform> {
-        self.parts.iter().map(|kind| if is_gradient { kind.transposed() } else { *kind }).collect()
-    }
-}
-
 /// Transforms the heads of `x: [B, N, P H E]` by `transforms: [B, N, transform_len(E)]`.
 pub(crate) fn transform<B: Backend>(
     x: &FloatTensor<B>,
     transforms: &FloatTensor<B>,
-    heads: Heads,
-    is_gradient: bool,
+    parts: &[HeadTransform],
+    num_heads: usize,
 ) -> FloatTensor<B> {
-    let (parts, num_heads) = (heads.kinds(is_gradient), heads.num_heads);
     let shape = x.shape();
     let [batch, count, width] = shape.dims();
     let tokens = batch * count;
@@ -41,9 +26,9 @@ pub(crate) fn transform<B: Backend>(
     let outputs = parts.iter().enumerate().map(|(part, kind)| {
         let x = narrow::<B>(&x, 1, part * num_heads..(part + 1) * num_heads); // [BN, H, E]
 
-        let first = if kind.is_inverse() { 16 } else { 0 };
+        let first = if kind.inverse { 16 } else { 0 };
         let matrix = B::float_reshape(narrow::<B>(&transforms, 2, first..first + 16), Shape::new([tokens, 4, 4]));
-        let matrix = if kind.is_transposed() { B::float_swap_dims(matrix, 1, 2) } else { matrix };
+        let matrix = if kind.transposed { B::float_swap_dims(matrix, 1, 2) } else { matrix };
         let vectors = B::float_reshape(narrow::<B>(&x, 2, 0..half), Shape::new([tokens, num_heads, 4, half / 4]));
         let vectors =
             B::float_reshape(B::float_permute(vectors, &[0, 2, 1, 3]), Shape::new([tokens, 4, num_heads * half / 4]));

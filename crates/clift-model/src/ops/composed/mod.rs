@@ -2,19 +2,13 @@
 //! Matrix products whose operands are rounded are an argument.
 //!
 //! - `primitives`: slices, sums and means that several of them use
-//! - `linear`: linear layer
-//! - `gelu`: GELU and its exact gradient
-//! - `norms`: layer norm, and RMS norms of heads
+//! - `layers`: linear layer, GELU, norms and convolutions
 //! - `attention`: softmax attention in chunks of queries
 //! - `cluster_attention`: attention inside clusters
 //! - `head_transform`: transforms of heads by the cameras of tokens
-//! - `convolution`: convolutions by Burn
 
 pub(crate) mod attention;
 pub(crate) mod cluster_attention;
-pub(crate) mod convolution;
-pub(crate) mod gelu;
 pub(crate) mod head_transform;
-pub(crate) mod linear;
-pub(crate) mod norms;
+pub(crate) mod layers;
 pub(crate) mod primitives;

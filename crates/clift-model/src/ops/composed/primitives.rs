@@ -6,7 +6,6 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, TensorMetadata};
 use burn::tensor::{Shape, Slice};
 
-/// Returns the entries `range` of a dimension.
 pub(crate) fn narrow<B: Backend>(x: &FloatTensor<B>, dim: usize, range: Range<usize>) -> FloatTensor<B> {
     let shape = x.shape();
     if range == (0..shape[dim]) {
@@ -34,24 +33,6 @@ pub(crate) fn mean<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     let shape = x.shape();
     let last = shape.num_dims() - 1;
     B::float_mul_scalar(B::float_sum_dim(x, last), (1.0 / shape[last] as f64).into())
-}
-
-/// Multiplies matrices in the type of the tensors.
-#[cfg(feature = "wgpu")]
-pub(crate) fn matmul<B: Backend>(lhs: FloatTensor<B>, rhs: FloatTensor<B>) -> FloatTensor<B> {
-    B::float_matmul(lhs, rhs)
-}
-
-/// Orders the dimensions as `dims` says.
-#[cfg(feature = "wgpu")]
-pub(crate) fn permute<B: Backend>(x: FloatTensor<B>, dims: [usize; 4]) -> FloatTensor<B> {
-    B::float_permute(x, &dims)
-}
-
-/// Joins tensors along their first dimension.
-#[cfg(feature = "wgpu")]
-pub(crate) fn cat<B: Backend>(parts: Vec<FloatTensor<B>>) -> FloatTensor<B> {
-    B::float_cat(parts, 0)
 }
 
 /// Returns the factor of the scores of attention, `1 / sqrt(head width)`.

@@ -9,7 +9,6 @@ use crate::tokens::kmeans::labels::Labels;
 /// Distances per matrix product for the table on the host: 4 MiB in f32, which fit into a cache.
 const BLOCK_LEN: usize = 1 << 20;
 
-/// The tokens of one scene with their squared lengths.
 pub(crate) struct Samples {
     /// Tokens minus their mean, `[N, D]`.
     tokens: Tensor<2>,

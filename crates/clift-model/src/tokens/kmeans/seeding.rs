@@ -31,7 +31,6 @@ pub(crate) fn pool_len(num_tokens: usize, num_clusters: usize, max_table_len: us
     (max_table_len / num_tokens).max(2 * num_clusters).min(num_tokens)
 }
 
-/// Candidates for centers.
 struct Pool {
     /// Distinct tokens, `[P]`.
     tokens: Vec<usize>,
@@ -111,7 +110,6 @@ impl Pool {
     }
 }
 
-/// Samples indices with probability proportional to their weights.
 struct WeightedIndices {
     cumulative: Vec<f64>,
 }
@@ -153,7 +151,7 @@ mod tests {
     use burn::tensor::{DType, Device, Tensor};
 
     use super::*;
-    use crate::testing::{devices, random, to_vec};
+    use crate::testing::{devices, random};
 
     fn samples(tokens: &Tensor<2>) -> Samples {
         Samples::new(tokens.clone()).expect("finite")
@@ -170,23 +168,6 @@ mod tests {
         let rows = samples.distances(centers);
         let nearest = |token| rows[token..].iter().step_by(samples.len()).copied().fold(f32::INFINITY, f32::min);
         (0..samples.len()).map(|token| f64::from(nearest(token))).sum()
-    }
-
-    #[test]
-    fn table_entries_are_squared_distances() {
-        for device in devices() {
-            let tokens = random([70, 9], 20, &device).cast(DType::F32);
-            let ids = [3, 69, 0, 41];
-            let table = samples(&tokens).distances(&ids);
-            let tokens: Vec<Vec<f64>> = to_vec(tokens).chunks(9).map(<[f64]>::to_vec).collect();
-            for (row, &id) in table.chunks(70).zip(&ids) {
-                for (got, other) in row.iter().zip(&tokens) {
-                    let expected: f64 = tokens[id].iter().zip(other).map(|(a, b)| (a - b).powi(2)).sum();
-                    assert!((f64::from(*got) - expected).abs() < 1e-5, "{got} against {expected}");
-                }
-                assert_eq!(row[id], 0.0);
-            }
-        }
     }
 
     #[test]
@@ -212,19 +193,6 @@ mod tests {
     }
 
     #[test]
-    fn a_sampled_pool_is_as_good_as_all_tokens() {
-        for device in devices() {
-            let samples = samples(&random([600, 8], 23, &device).cast(DType::F32));
-            let mean = |max_table_len| {
-                let one = |start| potential(&samples, &seed(&samples, 50, start, max_table_len));
-                (0..20).map(one).sum::<f64>() / 20.0
-            };
-            let (whole, sampled) = (mean(MAX_TABLE_LEN), mean(200 * 600));
-            assert!(sampled < 1.03 * whole, "{sampled} against {whole}");
-        }
-    }
-
-    #[test]
     fn a_pool_has_distinct_tokens_and_weights_of_all() {
         let device = Device::flex();
         let samples = samples(&clustered(&device));
@@ -242,44 +210,5 @@ mod tests {
         let mut weights = vec![0.0; pool.tokens.len()];
         (0..400).for_each(|token| weights[nearest_to(token)] += 1.0);
         assert_eq!(pool.weights, weights);
-    }
-
-    #[test]
-    fn few_distinct_tokens_give_fewer_centers() {
-        for max_table_len in [MAX_TABLE_LEN, 0] {
-            let tokens = Tensor::<2>::from_floats([[1.0, 0.0], [-1.0, 0.0], [0.0, 3.0]], &Device::flex());
-            let samples = samples(&tokens.repeat_dim(0, 20));
-            let centers = seed(&samples, 7, 5, max_table_len);
-            let mut indices: Vec<usize> = centers.iter().map(|token| token % 3).collect();
-            indices.sort_unstable();
-            indices.dedup();
-            assert_eq!(indices, [0, 1, 2]);
-        }
-    }
-
-    #[test]
-    fn samples_follow_the_weights() {
-        let weights = [0.0, 3.0, 0.0, 1.0, 4.0, 0.0];
-        let weighted = WeightedIndices::new(weights.into_iter());
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let mut counts = [0.0; 6];
-        (0..80_000).for_each(|_| counts[weighted.sample(&mut rng).expect("some weight is positive")] += 1e-4);
-        for (count, weight) in counts.into_iter().zip(weights) {
-            // Five standard deviations: the largest is 0.014.
-            assert!((count - weight).abs() < 0.07, "{count} against {weight}");
-            assert!(weight > 0.0 || count == 0.0);
-        }
-        assert_eq!(WeightedIndices::new([0.0; 3].into_iter()).sample(&mut rng), None);
-        assert_eq!(WeightedIndices::new(std::iter::empty()).sample(&mut rng), None);
-    }
-
-    #[test]
-    fn sum_of_smaller_adds_every_index() {
-        for len in [0, 1, 15, 16, 17, 100] {
-            let a: Vec<f32> = (0..len).map(|i| (i * 7 % 11) as f32).collect();
-            let b: Vec<f32> = (0..len).map(|i| (i * 5 % 13) as f32).collect();
-            let expected: f32 = a.iter().zip(&b).map(|(a, b)| a.min(*b)).sum();
-            assert_eq!(sum_of_smaller(&a, &b), expected);
-        }
     }
 }

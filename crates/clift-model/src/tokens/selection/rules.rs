@@ -9,6 +9,13 @@ use strum::{Display, IntoStaticStr, VariantArray};
 use crate::error::ModelError;
 use crate::names::parse_value;
 
+/// The distance of a token to a cell is the angle between their rays, in radians, plus this weight times the distance of their
+/// cameras, in normalized units.
+pub(crate) const DISTANCE_WEIGHT: f32 = 0.02;
+/// Subtracted from the distance of a token selected for the previous frame.
+pub(crate) const PREVIOUS_BONUS: f32 = 0.03;
+/// Weight of the distances of the previous frame.
+pub(crate) const MOMENTUM: f32 = 0.5;
 /// Side of a grid cell of the target view in pixels.
 const CELL_PX: f64 = 16.0;
 /// Cells along the shorter side of the image with scaled cells, as in an image of 256 pixels.
@@ -44,13 +51,7 @@ impl SelectionPreset {
 
     /// Returns the rules of the preset.
     pub fn rules(self) -> SelectionRules {
-        match self {
-            Self::Paper => SelectionRules::PAPER,
-            Self::Global => {
-                SelectionRules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..SelectionRules::PAPER }
-            }
-            Self::Scaled => SelectionRules { scaled_cells: true, cuts: true, ..SelectionRules::PAPER },
-        }
+        SelectionRules { per_cell: self != Self::Global, scaled: self == Self::Scaled }
     }
 }
 
@@ -62,49 +63,31 @@ impl FromStr for SelectionPreset {
     }
 }
 
-/// Distance of tokens to grid cells, tokens per cell, and the size of cells.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Tokens per cell, and the size of cells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SelectionRules {
-    /// The distance of a token to a cell is the angle between their rays, in radians, plus this weight times the distance
-    /// of their cameras, in normalized units.
-    pub distance_weight: f32,
-    /// Subtracted from the distance of a token selected for the previous frame.
-    pub previous_bonus: f32,
-    /// Weight of the distances of the previous frame, in `[0, 1)`.
-    pub momentum: f32,
-    /// Whether each of Q cells first selects its `R / Q` nearest tokens; the places left, of R, go to the tokens nearest to
-    /// any cell.
-    pub per_cell: bool,
-    /// Whether the side of a cell is 1/16 of the shorter side of the image instead of 16 pixels.
-    pub scaled_cells: bool,
-    /// Whether a frame whose camera turned by more than a cell starts without momentum and bonus. Departs from the paper,
-    /// whose frames are consecutive frames of a video: distances smoothed over a cut belong to no view.
-    pub cuts: bool,
+    /// Whether each of Q cells first selects its `R / Q` nearest tokens, with momentum and the bonus of the previous frame; the
+    /// places left, of R, go to the tokens nearest to any cell. Otherwise all places do.
+    pub(crate) per_cell: bool,
+    /// Whether the side of a cell is 1/16 of the shorter side of the image instead of 16 pixels, and a frame whose camera turned
+    /// by more than a cell starts without momentum and bonus. The paper's frames are consecutive frames of a video: distances
+    /// smoothed over a cut belong to no view.
+    pub(crate) scaled: bool,
 }
 
 impl SelectionRules {
-    /// Algorithm 1 of the paper.
-    pub const PAPER: Self = Self {
-        distance_weight: 0.02,
-        previous_bonus: 0.03,
-        momentum: 0.5,
-        per_cell: true,
-        scaled_cells: false,
-        cuts: false,
-    };
-
-    fn cell_px(&self, height: usize, width: usize) -> f64 {
-        if self.scaled_cells { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
+    fn cell_px(self, height: usize, width: usize) -> f64 {
+        if self.scaled { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
     }
 
     /// Returns rows and columns of the grid: cells that cover the image, and a margin of four cells.
-    pub(crate) fn grid(&self, height: usize, width: usize) -> [usize; 2] {
+    pub(crate) fn grid(self, height: usize, width: usize) -> [usize; 2] {
         let cell_px = self.cell_px(height, width);
         [height, width].map(|side| (side as f64 / cell_px).ceil() as usize + 2 * MARGIN_CELLS)
     }
 
     /// Returns the unit directions through the cell centers, `[rows * columns]`; margin cells lie outside the image.
-    pub(crate) fn cell_directions(&self, camera: &Camera, height: usize, width: usize) -> Vec<DVec3> {
+    pub(crate) fn cell_directions(self, camera: &Camera, height: usize, width: usize) -> Vec<DVec3> {
         let [rows, columns] = self.grid(height, width);
         let cell_px = self.cell_px(height, width);
         let center = |cell: usize| (cell as f64 - MARGIN_CELLS as f64 + 0.5) * cell_px;

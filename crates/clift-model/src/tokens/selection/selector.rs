@@ -9,13 +9,10 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::error::ModelError;
-use crate::tokens::selection::rules::SelectionRules;
+use crate::tokens::selection::rules::{DISTANCE_WEIGHT, MOMENTUM, PREVIOUS_BONUS, SelectionRules};
 use crate::tokens::selection::token_ray::TokenRay;
 
-/// Fewest cells per task.
 const CELLS_PER_TASK: usize = 16;
-/// Added to the distance of tokens that are not candidates: more than any angle and any distance of near views.
-const NOT_A_CANDIDATE: f32 = 8.0;
 /// Distances of a row whose minimum is compared with the limit at once.
 const GROUP: usize = 32;
 
@@ -25,13 +22,11 @@ pub struct Selector {
     rules: SelectionRules,
     origins: Vec<DVec3>,
     directions: Directions,
-    /// Rows and columns of the previous frame's grid.
     grid: [usize; 2],
-    /// Smoothed distances of the previous frame, `[Q][S]`; empty rows without momentum.
+    /// Smoothed distances of the previous frame, `[Q][S]`.
     field: Vec<Vec<f32>>,
     /// Whether a token was selected for the previous frame; empty before the first frame.
     previous: Vec<bool>,
-    /// Axis of the camera of the last frame.
     last_axis: Option<DVec3>,
 }
 
@@ -47,18 +42,12 @@ struct Directions {
 struct Nearest {
     /// Smallest distance of every token to a cell.
     distance: Vec<f32>,
-    /// Whether a cell selected the token.
     selected: Vec<bool>,
-    /// Distances of one cell, if the field is not kept.
-    row: Vec<f32>,
     candidates: Vec<(f32, u32)>,
 }
 
 impl Selector {
     /// Prepares the tokens of a scene.
-    ///
-    /// # Errors
-    /// [`ModelError::BadRay`] for a ray that is not finite or whose direction has length zero.
     pub fn new(rules: SelectionRules, rays: &[TokenRay]) -> Result<Self, ModelError> {
         let mut directions = Directions { x: Vec::new(), y: Vec::new(), z: Vec::new() };
         for (token, ray) in rays.iter().enumerate() {
@@ -92,31 +81,13 @@ impl Selector {
 
     /// Selects exactly `min(num_render_tokens, num_storage_tokens)` tokens for the next frame, a view of `height` by
     /// `width` pixels, and returns their ids in ascending order. A frame of another size than the previous frame starts
-    /// without momentum.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for zero tokens, [`ModelError::NotFinite`] for a camera that is not finite.
+    /// without momentum. Errors: [`ModelError::BadConfig`] for zero tokens, [`ModelError::NotFinite`] for a camera that is not
+    /// finite.
     pub fn select(
         &mut self,
         camera: &Camera,
         height: usize,
         width: usize,
-        num_render_tokens: usize,
-    ) -> Result<Vec<u32>, ModelError> {
-        self.select_among(&[], camera, [height, width], num_render_tokens)
-    }
-
-    /// Selects tokens as [`select`](Self::select) does, candidates before others. `is_candidate` has a value per token, or
-    /// none if all are candidates. Momentum holds for candidates too: those that were none for the previous frames are
-    /// selected a few frames later.
-    ///
-    /// # Errors
-    /// As [`select`](Self::select).
-    pub fn select_among(
-        &mut self,
-        is_candidate: &[bool],
-        camera: &Camera,
-        [height, width]: [usize; 2],
         num_render_tokens: usize,
     ) -> Result<Vec<u32>, ModelError> {
         if num_render_tokens == 0 {
@@ -132,7 +103,7 @@ impl Selector {
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
-        let offsets = self.offsets(camera.c2w.translation, is_candidate);
+        let offsets = self.offsets(camera.c2w.translation);
         let nearest = self.measure(&cells, self.rules.grid(height, width), &offsets, per_cell);
         let chosen = nearest.choose(num_render_tokens);
         self.previous = vec![false; num_storage_tokens];
@@ -147,7 +118,7 @@ impl Selector {
         let angle = |a: DVec3, b: DVec3| a.dot(b).clamp(-1.0, 1.0).acos();
         let (axis, middle) = (camera.c2w.rotation.z_axis, rows / 2 * columns + columns / 2);
         let cell = angle(cells[middle], cells[middle - 1]);
-        if self.rules.cuts && self.last_axis.is_some_and(|last| angle(last, axis) > cell) {
+        if self.rules.scaled && self.last_axis.is_some_and(|last| angle(last, axis) > cell) {
             self.reset();
         }
         self.last_axis = Some(axis);
@@ -156,38 +127,29 @@ impl Selector {
     /// Updates the smoothed distances of all tokens to all cells and returns the nearest tokens.
     fn measure(&mut self, cells: &[DVec3], grid: [usize; 2], offsets: &[f32], per_cell: usize) -> Nearest {
         let num_tokens = self.origins.len();
-        let SelectionRules { momentum, .. } = self.rules;
-        let keeps_field = momentum > 0.0;
-        let momentum = if self.grid == grid { momentum } else { 0.0 };
+        let momentum = if self.grid == grid && self.rules.per_cell { MOMENTUM } else { 0.0 };
         if self.grid != grid {
             self.grid = grid;
-            let row = if keeps_field { vec![0.0; num_tokens] } else { Vec::new() };
-            self.field = vec![row; cells.len()];
+            self.field = vec![vec![0.0; num_tokens]; cells.len()];
         }
         let directions = &self.directions;
-        let weigh = |mut found: Nearest, (cell, kept): (&DVec3, &mut Vec<f32>)| {
-            let mut scratch = std::mem::take(&mut found.row);
-            let row = if keeps_field { kept } else { &mut scratch };
+        let weigh = |mut found: Nearest, (cell, row): (&DVec3, &mut Vec<f32>)| {
             directions.add_distances(cell.as_vec3(), offsets, momentum, row);
-            for (nearest, &distance) in found.distance.iter_mut().zip(row.iter()) {
-                *nearest = if distance < *nearest { distance } else { *nearest };
-            }
+            found.take_smaller(row);
             found.select_nearest(row, per_cell);
-            found.row = scratch;
             found
         };
-        let none = || Nearest::none(num_tokens, keeps_field);
+        let none = || Nearest::none(num_tokens);
         let cells = cells.par_iter().zip(self.field.par_iter_mut()).with_min_len(CELLS_PER_TASK);
         cells.fold(none, weigh).reduce(none, Nearest::merge)
     }
 
     /// Returns the part of every token's distance that is equal for all cells.
-    fn offsets(&self, target: DVec3, is_candidate: &[bool]) -> Vec<f32> {
-        let SelectionRules { distance_weight, previous_bonus, .. } = self.rules;
+    fn offsets(&self, target: DVec3) -> Vec<f32> {
         let offset = |(token, origin): (usize, &DVec3)| {
-            let bonus = if self.previous.get(token) == Some(&true) { previous_bonus } else { 0.0 };
-            let penalty = if is_candidate.get(token) == Some(&false) { NOT_A_CANDIDATE } else { 0.0 };
-            distance_weight * origin.distance(target) as f32 - bonus + penalty
+            let has_bonus = self.rules.per_cell && self.previous.get(token) == Some(&true);
+            let bonus = if has_bonus { PREVIOUS_BONUS } else { 0.0 };
+            DISTANCE_WEIGHT * origin.distance(target) as f32 - bonus
         };
         self.origins.iter().enumerate().map(offset).collect()
     }
@@ -241,23 +203,20 @@ fn keep_nearest(candidates: &mut Vec<(f32, u32)>, count: usize) {
 }
 
 impl Nearest {
-    fn none(num_tokens: usize, keeps_field: bool) -> Self {
-        Self {
-            distance: vec![f32::INFINITY; num_tokens],
-            selected: vec![false; num_tokens],
-            row: if keeps_field { Vec::new() } else { vec![0.0; num_tokens] },
-            candidates: Vec::new(),
-        }
+    fn none(num_tokens: usize) -> Self {
+        Self { distance: vec![f32::INFINITY; num_tokens], selected: vec![false; num_tokens], candidates: Vec::new() }
     }
 
     fn merge(mut self, other: Self) -> Self {
-        for (a, b) in self.distance.iter_mut().zip(&other.distance) {
+        self.take_smaller(&other.distance);
+        self.selected.iter_mut().zip(&other.selected).for_each(|(a, b)| *a |= *b);
+        self
+    }
+
+    fn take_smaller(&mut self, distance: &[f32]) {
+        for (a, b) in self.distance.iter_mut().zip(distance) {
             *a = if *b < *a { *b } else { *a };
         }
-        for (a, b) in self.selected.iter_mut().zip(&other.selected) {
-            *a |= *b;
-        }
-        self
     }
 
     /// Selects the `count` tokens nearest to a cell (Algorithm 1, first step).

@@ -1,5 +1,7 @@
 //! The codec end to end: rates near the entropy, bounded errors, hostile words, and its file.
 
+use std::collections::BTreeMap;
+
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -73,9 +75,17 @@ fn streams_take_the_bits_of_their_entropy() {
     let codec = small();
     let unseen = tokens(32_000, DIM, 99);
     for step in [0.2, 1.0, 4.0] {
-        let mut counts = LevelCounts::default();
-        let stream = codec.count_bits(&unseen, places(&ids(32_000)), step, &mut counts).unwrap();
-        let entropy = counts.entropy_bits();
+        let stream = codec.stream_bits(&unseen, places(&ids(32_000)), step).unwrap();
+        let (levels, neighbours) = codec.quantize(&unseen, places(&ids(32_000)), step).unwrap();
+        let mut counts = BTreeMap::<_, BTreeMap<i32, f64>>::new();
+        codec.for_each_deviation(&levels, &neighbours, step, |known, deviation, _| {
+            *counts.entry(known).or_default().entry(deviation).or_default() += 1.0;
+        });
+        let bits = |counts: &BTreeMap<i32, f64>| {
+            let total: f64 = counts.values().sum();
+            counts.values().map(|count| count * (total / count).log2()).sum::<f64>()
+        };
+        let entropy: f64 = counts.values().map(bits).sum();
         assert!(stream < 1.02 * entropy + 64.0, "step {step}: {stream} bits, entropy {entropy}");
         assert!(stream > 0.99 * entropy, "step {step}: {stream} bits, entropy {entropy}");
     }

@@ -36,7 +36,6 @@ pub(crate) fn scene() -> Scene {
     }
 }
 
-/// The file with changes in its header.
 pub(crate) fn with_header(bytes: &[u8], changes: &[(&str, &str)]) -> Vec<u8> {
     let (length, rest) = bytes.split_first_chunk().expect("a length");
     let (header, rest) = rest.split_at(u64::from_le_bytes(*length) as usize);
@@ -48,14 +47,14 @@ pub(crate) fn with_header(bytes: &[u8], changes: &[(&str, &str)]) -> Vec<u8> {
     [&(header.len() as u64).to_le_bytes(), header.as_bytes(), rest].concat()
 }
 
-struct Folder(tempfile::TempDir);
+pub(crate) struct Folder(pub tempfile::TempDir);
 
 impl Folder {
-    fn new() -> Self {
+    pub fn new() -> Self {
         Self(tempfile::tempdir().expect("a temporary folder"))
     }
 
-    fn path(&self) -> PathBuf {
+    pub fn path(&self) -> PathBuf {
         self.0.path().join("room.clift")
     }
 
@@ -64,7 +63,7 @@ impl Folder {
         std::fs::read(self.path()).expect("reads")
     }
 
-    fn assert_refused(&self, bytes: &[u8], expected: &str) {
+    pub fn assert_refused(&self, bytes: &[u8], expected: &str) {
         std::fs::write(self.path(), bytes).expect("writes");
         let error = Scene::read(&self.path()).expect_err("an invalid file");
         std::fs::remove_file(self.path()).expect("removes");
@@ -74,27 +73,26 @@ impl Folder {
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
     }
 
-    fn assert_header_refused(&self, changes: &[(&str, &str)], expected: &str) {
-        self.assert_refused(&with_header(&self.bytes(TokenFormat::F32), changes), expected);
-    }
-
-    fn write_error(&self, scene: &Scene, name: &str, format: TokenFormat) -> String {
-        scene.write(&self.0.path().join(name), format).unwrap_err().to_string()
+    fn assert_not_written(&self, scene: &Scene, format: TokenFormat, expected: &str) {
+        let message = scene.write(&self.path(), format).unwrap_err().to_string();
+        assert!(message.contains(expected), "{message}");
     }
 }
 
 #[test]
 fn scenes_survive_a_file_whose_size_is_the_formula() {
     let folder = Folder::new();
-    for format in TokenFormat::ALL {
-        let bytes = folder.bytes(format);
-        let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * (28 + format.bytes_per_token(DIM));
-        assert_eq!((bytes.len(), scene().file_bytes(format)), (expected, expected as u64), "{format}");
-        let (back, found) = Scene::read(&folder.path()).expect("reads");
-        assert_eq!(found, format.into());
-        assert_eq!(back, Scene { tokens: format.round(&scene().tokens, DIM).expect("in range"), ..scene() });
-        assert_eq!(folder.bytes(format), bytes, "equal scenes are equal files");
-        assert!(format != TokenFormat::F32 || back == scene(), "f32 is exact");
+    for (scene, place) in [(scene(), 28), (latents(), 0)] {
+        for format in TokenFormat::ALL {
+            scene.write(&folder.path(), format).expect("writes");
+            let bytes = std::fs::read(folder.path()).expect("reads");
+            let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * (place + format.bytes_per_token(DIM));
+            assert_eq!((bytes.len(), scene.file_bytes(format)), (expected, expected as u64), "{format}");
+            let tokens = format.round(&scene.tokens, DIM).expect("in range");
+            assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..scene.clone() }, format.into()));
+            scene.write(&folder.path(), format).expect("writes");
+            assert_eq!(std::fs::read(folder.path()).expect("reads"), bytes, "equal scenes are equal files");
+        }
     }
     assert_eq!(std::fs::read_dir(folder.0.path()).expect("a folder").count(), 1, "no temporary file is left");
 }
@@ -131,182 +129,110 @@ fn groups_survive_a_file_and_own_the_tokens_of_their_views() {
     assert_eq!(scene.token_rays()[3].origin, c2w.translation);
     assert!(scene.token_rays()[3].direction.abs_diff_eq(expected, 1e-12));
     let learned = Scene { model: small_lvsm(), kind: TokenKind::All, ..scene };
-    let message = folder.write_error(&learned, "learned", TokenFormat::F32);
-    assert!(message.contains("2 groups of learned tokens, expected one"), "{message}");
+    folder.assert_not_written(&learned, TokenFormat::F32, "2 groups of learned tokens, expected one");
 }
 
-#[test]
-fn latents_are_stored_without_places() {
-    let folder = Folder::new();
+fn latents() -> Scene {
     let model = ModelConfig { dim: DIM, num_heads: 2, num_latents: 5, ..small_lvsm() };
-    let latents = Scene { kind: TokenKind::All, model, token_ids: (0..5).collect(), ..scene() };
-    for format in TokenFormat::ALL {
-        latents.write(&folder.path(), format).expect("writes");
-        let bytes = std::fs::read(folder.path()).expect("reads");
-        let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * format.bytes_per_token(DIM);
-        assert_eq!((bytes.len(), latents.file_bytes(format)), (expected, expected as u64), "{format}");
-        let tokens = format.round(&latents.tokens, DIM).expect("in range");
-        assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..latents.clone() }, format.into()));
-    }
-    let bytes = std::fs::read(folder.path()).expect("reads");
-    for (from, to, expected) in [
-        (r#"\"dim\":8"#, r#"\"dim\":0"#, "`model.dim` = 0"),
-        (r#"num_latents\":5"#, r#"num_latents\":4"#, "`token_scales` is F32 [5], expected F32 [4]"),
-    ] {
-        folder.assert_refused(&with_header(&bytes, &[(from, to)]), expected);
-    }
-    let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
-    assert!(folder.write_error(&few, "few", TokenFormat::F32).contains("expected all 5 learned tokens in order"));
-    let kind = Scene { kind: TokenKind::Clift, ..latents };
-    assert!(folder.write_error(&kind, "kind", TokenFormat::F32).contains("clift tokens of a network of lvsm-ed"));
+    Scene { kind: TokenKind::All, model, token_ids: (0..5).collect(), ..scene() }
 }
 
 #[test]
-fn files_are_safetensors_with_rays_through_patch_centres() {
-    let bytes = Folder::new().bytes(TokenFormat::F16);
-    let file = SafeTensors::deserialize(&bytes).expect("valid safetensors");
-    let tensor = |name: &str| file.tensor(name).expect("there");
-    assert_eq!((tensor("tokens").shape(), tensor("token_rays").shape()), (&[5, DIM][..], &[5, 6][..]));
-    let rays: Vec<f32> =
-        tensor("token_rays").data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
-    // Token 0 is patch 0: the first of view 0. Token 3 is patch 7: row 0, column 1 of view 1.
-    for (token, camera, [x, y]) in [(0, camera(-1.0, 0.2), [4.0, 4.0]), (3, camera(1.0, -0.3), [12.0, 4.0])] {
-        let direction = camera.direction(x, y);
-        for (got, expected) in rays[6 * token + 3..].iter().zip(direction.to_array()) {
-            assert!((f64::from(*got) - expected).abs() < 1e-7, "token {token}: {rays:?} against {direction:?}");
-        }
-        assert_eq!(scene().token_rays()[token].origin, camera.c2w.translation);
-    }
+fn other_latents_than_those_of_the_network_are_refused() {
+    let (folder, latents) = (Folder::new(), latents());
+    latents.write(&folder.path(), TokenFormat::Int8).expect("writes");
+    let bytes = std::fs::read(folder.path()).expect("reads");
+    let fewer = with_header(&bytes, &[(r#"num_latents\":5"#, r#"num_latents\":4"#)]);
+    folder.assert_refused(&fewer, "`token_scales` is F32 [5], expected F32 [4]");
+    let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
+    folder.assert_not_written(&few, TokenFormat::F32, "expected all 5 learned tokens in order");
+    let kind = Scene { kind: TokenKind::Clift, ..latents };
+    folder.assert_not_written(&kind, TokenFormat::F32, "clift tokens of a network of lvsm-ed");
 }
 
 #[test]
 fn damaged_files_are_refused_with_a_remedy() {
     let folder = Folder::new();
-    folder.assert_refused(b"", "the file is truncated: 0 bytes; copy it again");
     folder.assert_refused(&[9, 0, 0], "the file is truncated: 3 bytes; copy it again");
     folder.assert_refused(b"\x89PNG\r\n\x1a\n and so on", "give a file that `clift encode` wrote");
     let bytes = folder.bytes(TokenFormat::Int8);
-    for length in [8, 1000, 8 + HEADER_BYTES - 1] {
-        folder
-            .assert_refused(&bytes[..length], &format!("truncated: {length} bytes with a header of 2048 bytes; copy"));
-    }
+    let length = 8 + HEADER_BYTES - 1;
+    folder.assert_refused(&bytes[..length], "truncated: 2055 bytes with a header of 2048 bytes; copy");
     let cut = "the file is truncated or has bytes after its last tensor; copy it again";
     for bytes in [&bytes[..8 + HEADER_BYTES], &bytes[..bytes.len() - 1], &[&bytes[..], &[0]].concat()[..]] {
         folder.assert_refused(bytes, cut);
     }
-    for length in [u64::MAX, 1 << 63, 100_000_000, (1 << 16) + 1] {
+    for length in [u64::MAX, (1 << 16) + 1] {
         let bytes = [&length.to_le_bytes()[..], &bytes[8..]].concat();
         folder.assert_refused(&bytes, &format!("header of {length} bytes, expected at most 65536"));
     }
-    let message = |path: PathBuf| Scene::read(&path).unwrap_err().to_string();
-    let missing = message(folder.0.path().join("no.clift"));
-    assert!(missing.contains("No such file") && missing.ends_with("no.clift"), "{missing}");
     let file = std::fs::File::create(folder.path()).expect("creates");
     file.set_len((1 << 30) + 1).expect("a sparse file");
-    let large = message(folder.path());
+    let large = Scene::read(&folder.path()).unwrap_err().to_string();
     assert!(large.contains("the file has 1073741825 bytes, a scene at most 1073741824"), "{large}");
 }
 
 #[test]
 fn invalid_headers_are_refused() {
     let folder = Folder::new();
+    let bytes = folder.bytes(TokenFormat::F32);
+    let refused =
+        |changes: &[(&str, &str)], expected: &str| folder.assert_refused(&with_header(&bytes, changes), expected);
     for field in ["kind", "model", "renderer", "key", "height", "model_path"] {
         let [from, to] = ["", "not_"].map(|start| format!("\"{start}{field}\":"));
-        folder.assert_header_refused(&[(&from, &to)], &format!("no `{field}` in the header; encode the scene again"));
+        refused(&[(&from, &to)], &format!("no `{field}` in the header; encode the scene again"));
     }
-    let unreadable = "unreadable header";
+    let other_version =
+        "scene file of version 9, this clift reads versions 6 and 7; encode the scene again, or render it";
     for (from, to, expected) in [
         (r#""format":"clift-scene""#, r#""format":"clift-1""#, "its header lacks the scene format; give a file"),
-        (r#"{"__metadata__""#, r#"{"__metadata__"#, unreadable),
-        (
-            r#""version":"6""#,
-            r#""version":"9""#,
-            "scene file of version 9, this clift reads versions 6 and 7; encode the scene again, or render it with",
-        ),
-        (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
+        (r#"{"__metadata__""#, r#"{"__metadata__"#, "unreadable header"),
+        (r#""version":"6""#, r#""version":"9""#, other_version),
         (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number"#),
         (r#""renderer":"0123"#, r#""renderer":"zz23"#, "expected 64 hexadecimal digits"),
-        // Sizes of the model.
-        (r#"num_heads\":2"#, r#"num_heads\":3"#, "`model.num_heads` = 3: write a divisor of model.dim = 8"),
+        // Sizes of the model and of the views.
         ("num_heads", "num_hands", "unreadable `model` (unknown field"),
         (r#"\"dim\":8"#, r#"\"dim\":99999999999"#, "`model.dim` = 99999999999: write at most 65536"),
         (r#"patch_size\":8"#, r#"patch_size\":1"#, "ray of token 0: "),
-        // Sizes of the views.
-        (r#""height":"16""#, r#""height":"17""#, "does not divide into patches"),
-        (r#""height":"16""#, r#""height":"0""#, "does not divide into patches"),
         (r#""height":"16""#, r#""height":"8""#, "token 1 of patch 11, expected less than 6"),
         (r#""width":"24""#, r#""width":"18446744073709551608""#, "expected at most 16384 a side"),
         // Names, types and shapes of tensors.
-        (r#""token_ids""#, r#""token_idz""#, "no tensor `token_ids`"),
-        (
-            r#""dtype":"F64","shape":[2, 4]"#,
-            r#""dtype":"F32","shape":[4, 4]"#,
-            "`context_intrinsics` is F32 [4, 4], expected F64 [2, 4]",
-        ),
         (r#""shape":[5, 8]"#, r#""shape":[8, 5]"#, "`tokens` is F32 [8, 5], expected F32 [5, 8]"),
-        (
-            r#""dtype":"F32","shape":[5, 8]"#,
-            r#""dtype":"I32","shape":[5, 8]"#,
-            "`tokens` is I32, expected F32, F16 or I8",
-        ),
+        (r#""F32","shape":[5, 8]"#, r#""I32","shape":[5, 8]"#, "`tokens` is I32, expected F32, F16 or I8"),
         (r#""U32","shape":[5]"#, r#""U32","shape":[5, 1]"#, "`token_ids` has the shape [5, 1], expected one dimension"),
         (r#""tokens":"#, r#""tokens":{"dtype":"F32","shape":[0],"data_offsets":[0,0]},"more":"#, ""),
-        // Offsets that overlap, overflow or leave the file.
-        (r#""data_offsets":[0,256]"#, r#""data_offsets":[8,264]"#, unreadable),
-        (r#""data_offsets":[0,256]"#, r#""data_offsets":[256,0]"#, unreadable),
-        (r#""data_offsets":[0,256]"#, r#""data_offsets":[0,18446744073709551615]"#, unreadable),
-        (r#""shape":[2, 4, 4]"#, r#""shape":[4294967296, 4294967296, 4]"#, unreadable),
     ] {
-        folder.assert_header_refused(&[(from, to)], expected);
+        refused(&[(from, to)], expected);
     }
     let large = [
         (r#"patch_size\":8"#, r#"patch_size\":1"#),
         (r#""height":"16""#, r#""height":"16384""#),
         ("\"24\"", "\"16384\""),
     ];
-    folder.assert_header_refused(&large, "536870912 patches of context views, expected at most 1048576");
+    refused(&large, "536870912 patches of context views, expected at most 1048576");
 }
 
 #[test]
 fn invalid_tensor_values_are_refused() {
     let (f32_nan, f64_nan) = (f32::NAN.to_le_bytes(), f64::NAN.to_le_bytes());
     let (f32, f16, int8) = (TokenFormat::F32, TokenFormat::F16, TokenFormat::Int8);
+    let last_row = "context camera 0: bad camera: the last row of the pose is [0.0, 0.0, 0.0, 0.5]";
     let cases: &[(TokenFormat, &str, usize, &[u8], &str)] = &[
         (f32, "tokens", 4 * 17, &f32_nan, "token 2 contains NaN"),
         (f16, "tokens", 2 * 8, &half::f16::INFINITY.to_le_bytes(), "token 1 contains inf"),
-        (int8, "token_scales", 4, &f32_nan, "scale NaN of token 1"),
         (int8, "token_scales", 0, &(-1.0_f32).to_le_bytes(), "scale -1 of token 0"),
         (int8, "token_scales", 0, &f32::MAX.to_le_bytes(), "token 0 contains -inf"),
         (f32, "token_rays", 24 + 8, &f32_nan, "ray of token 1: "),
         (f32, "context_c2w", 8 * 16, &f64_nan, "context camera 1: bad camera: the pose holds NaN"),
-        (
-            f32,
-            "context_c2w",
-            0,
-            &2.0_f64.to_le_bytes(),
-            "context camera 0: bad camera: the rotation is off an orthonormal",
-        ),
-        (
-            f32,
-            "context_c2w",
-            8 * 15,
-            &0.5_f64.to_le_bytes(),
-            "context camera 0: bad camera: the last row of the pose is [0.0, 0.0, 0.0, 0.5]",
-        ),
-        (f32, "context_c2w", 8 * 5, &(-1.0_f64).to_le_bytes(), "context camera 0: bad camera: the rotation mirrors"),
+        (f32, "context_c2w", 8 * 15, &0.5_f64.to_le_bytes(), last_row),
         (f32, "context_c2w", 8 * 7, &1e5_f64.to_le_bytes(), "context camera 0: bad camera: the camera is 100000 times"),
-        (f32, "context_intrinsics", 0, &f64_nan, "context camera 0: bad camera: fx is NaN"),
         (f32, "context_intrinsics", 8, &(-20.0_f64).to_le_bytes(), "context camera 0: bad camera: fy is -20"),
         (f32, "world_mean_c2w", 8, &f64_nan, "mean pose: bad camera: the pose holds NaN"),
-        (f32, "world_scale", 0, &f64_nan, "pose scale NaN"),
-        (f32, "world_scale", 0, &0.0_f64.to_le_bytes(), "pose scale 0"),
         (f32, "group_sizes", 0, &1_u32.to_le_bytes(), "1 views after the last group"),
         (f32, "group_sizes", 0, &3_u32.to_le_bytes(), "group 0 has 3 views, 2 are left of 2"),
         (f32, "group_views", 4, &2_u32.to_le_bytes(), "a group of context view 2, expected less than 2"),
         (f32, "group_scale", 0, &0.0_f64.to_le_bytes(), "pose scale 0"),
-        (f32, "group_mean_c2w", 0, &f64_nan, "mean pose: bad camera: the pose holds NaN"),
         (f32, "token_ids", 4, &12_u32.to_le_bytes(), "token 1 of patch 12, expected less than 12"),
-        (f32, "token_ids", 4, &u32::MAX.to_le_bytes(), "token 1 of patch 4294967295, expected less than 12"),
         (f32, "token_ids", 8, &0_u32.to_le_bytes(), "two tokens of patch 0, the second is token 2"),
         (f32, "token_ids", 4, &10_u32.to_le_bytes(), "ray of token 1: "),
     ];
@@ -321,31 +247,6 @@ fn invalid_tensor_values_are_refused() {
 }
 
 #[test]
-fn only_scene_files_are_overwritten() {
-    let folder = Folder::new();
-    let bytes = folder.bytes(TokenFormat::F32);
-    folder.bytes(TokenFormat::F16);
-    std::fs::write(folder.path(), &bytes[..1000]).unwrap();
-    folder.bytes(TokenFormat::F16); // replaces a truncated scene
-    let weights = folder.0.path().join("model.safetensors");
-    std::fs::write(&weights, b"weights").unwrap();
-    #[cfg(unix)]
-    std::os::unix::fs::symlink(folder.path(), folder.0.path().join("link.clift")).unwrap();
-    for (name, expected) in [
-        ("model.safetensors", "the existing file is not a scene, and only scenes are overwritten; choose another name"),
-        (".", "is not a regular file"),
-        #[cfg(unix)]
-        ("link.clift", "is not a regular file"),
-        ("no/room.clift", "no folder "),
-        ("room.clift/room.clift", "no folder "),
-    ] {
-        let message = folder.write_error(&scene(), name, TokenFormat::F16);
-        assert!(message.contains(expected), "{name}: {message}");
-    }
-    assert_eq!(std::fs::read(&weights).unwrap(), b"weights");
-}
-
-#[test]
 fn a_failed_write_leaves_the_old_file() {
     let folder = Folder::new();
     let before = folder.bytes(TokenFormat::F32);
@@ -356,9 +257,19 @@ fn a_failed_write_leaves_the_old_file() {
         (Scene { key: "k".repeat(1800), ..scene() }, TokenFormat::F32, "together are longer than"),
         (Scene { tokens: vec![1e5; 5 * DIM], ..scene() }, TokenFormat::F16, "a token contains 100000"),
     ] {
-        let message = folder.write_error(&scene, "room.clift", format);
-        assert!(message.contains(expected), "{message}");
+        folder.assert_not_written(&scene, format, expected);
     }
     assert_eq!(std::fs::read(folder.path()).expect("still there"), before);
     assert_eq!(std::fs::read_dir(folder.0.path()).expect("a folder").count(), 1);
+    // Files that are not scenes, and links, stay; a truncated scene is replaced.
+    std::fs::write(folder.path(), &before[..1000]).unwrap();
+    folder.bytes(TokenFormat::F16);
+    std::fs::write(folder.path(), b"weights").unwrap();
+    folder.assert_not_written(&scene(), TokenFormat::F16, "the existing file is not a scene, and only scenes are");
+    std::fs::rename(folder.path(), folder.0.path().join("weights")).unwrap();
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(folder.0.path().join("weights"), folder.path()).unwrap();
+        folder.assert_not_written(&scene(), TokenFormat::F16, "is not a regular file");
+    }
 }

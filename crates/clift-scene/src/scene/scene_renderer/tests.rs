@@ -1,6 +1,6 @@
 //! Renderings of scenes, groups and windows against independent references.
 
-use clift_model::{CameraEncoding, Network, RayFrame, SelectionPreset, psnr, save_weights};
+use clift_model::{CameraEncoding, Network, SelectionPreset, psnr, save_weights};
 
 use super::*;
 use crate::scene::scene::tests::{camera, scene, scene_of_groups};
@@ -22,11 +22,16 @@ fn encoded(camera_encoding: CameraEncoding) -> ModelConfig {
     }
 }
 
+/// `scene` with tokens for all of its `count` patches.
+fn with_tokens(scene: Scene, count: u32, renderer: &Renderer, config: &ModelConfig) -> Scene {
+    let tokens = (0..count * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
+    let renderer_hash = renderer_hash(renderer, config);
+    Scene { model: config.clone(), renderer_hash, tokens, token_ids: (0..count).collect(), ..scene }
+}
+
 /// A scene with all 12 tokens of two views of 24 x 16 pixels.
 fn whole_scene(renderer: &Renderer, config: &ModelConfig) -> Scene {
-    let tokens = (0..12 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
-    let renderer_hash = renderer_hash(renderer, config);
-    Scene { model: config.clone(), renderer_hash, tokens, token_ids: (0..12).collect(), ..scene() }
+    with_tokens(scene(), 12, renderer, config)
 }
 
 fn path(num_frames: usize) -> Vec<Camera> {
@@ -76,20 +81,12 @@ fn frames_equal_images_of_their_tokens_alone() {
     }
 }
 
-/// The scene of two groups with all its 24 patches, on views of 24 x 16 pixels.
-fn grouped_scene(renderer: &Renderer, config: &ModelConfig) -> Scene {
-    let tokens = (0..24 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
-    let renderer_hash = renderer_hash(renderer, config);
-    let token_ids = (0..24).collect();
-    Scene { model: config.clone(), renderer_hash, tokens, token_ids, ..scene_of_groups() }
-}
-
 #[test]
 fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
     let device = Device::flex();
     for config in CameraEncoding::ALL.map(encoded) {
         let renderer = Network::new(&config, 3, &device).renderer;
-        let scene = grouped_scene(&renderer, &config);
+        let scene = with_tokens(scene_of_groups(), 24, &renderer, &config);
         let rules = SelectionPreset::Paper.rules();
         let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
         for (group, view) in [(0, scene.context[0]), (1, scene.context[2])] {
@@ -117,69 +114,6 @@ fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
     }
 }
 
-#[test]
-fn a_network_with_rays_of_cameras_renders_from_the_tokens_of_all_groups() {
-    let device = Device::flex();
-    let config = ModelConfig { rays: RayFrame::Camera, ..encoded(CameraEncoding::Gta) };
-    let renderer = Network::new(&config, 3, &device).renderer;
-    let mut scene = grouped_scene(&renderer, &config);
-    scene.groups.iter_mut().for_each(|group| group.frame = ContextGroup::of_all(0).frame);
-    let members: Vec<Camera> =
-        scene.groups.iter().flat_map(|group| &group.views).map(|&view| scene.context[view as usize]).collect();
-    let members = Cameras::of_views(&members, 16, 24, &device).unwrap();
-    let rules = SelectionPreset::Paper.rules();
-    let mut whole = SceneRenderer::new(&scene, renderer.clone(), rules, &device).unwrap();
-    assert_eq!(whole.max_render_tokens(), 24);
-    for (count, view) in [(9, scene.context[1]), (24, scene.context[1]), (30, scene.context[0])] {
-        let got = whole.render(&[view], 16, 24, count).unwrap().remove(0);
-        let ids = got.tokens.unwrap_or_else(|| (0..24).collect());
-        assert_eq!(ids.len(), count.min(24));
-        assert!(ids.iter().any(|&id| id < 12) && ids.iter().any(|&id| id >= 12), "of both groups: {ids:?}");
-        let values = ids.iter().flat_map(|&id| &scene.tokens[id as usize * 16..][..16]).copied();
-        let values = TensorData::new(values.collect::<Vec<f32>>(), [1, ids.len(), 16]);
-        let tokens = Tokens::of_patches(&config, Tensor::from_data(values, &device), &members, &ids);
-        let cameras = Cameras::of_views(&[view], 16, 24, &device).unwrap();
-        let expected = renderer.forward(tokens, &cameras).into_data().convert::<f32>();
-        let pairs = got.pixels.iter().zip(expected.as_slice::<f32>().unwrap());
-        let error = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        // f32: keys and values are projected before the selection, not after it.
-        assert!(error <= 1e-6, "{error} with {count} tokens");
-        whole.reset();
-    }
-}
-
-#[test]
-fn a_view_is_rendered_from_the_tokens_of_the_eight_nearest_views() {
-    let device = Device::flex();
-    let config = ModelConfig { rays: RayFrame::Camera, ..encoded(CameraEncoding::Gta) };
-    let renderer = Network::new(&config, 3, &device).renderer;
-    // Ten views in a row of 6 patches each, in five groups.
-    let context: Vec<Camera> = (0..10).map(|view| camera(0.2 * f64::from(view), 0.0)).collect();
-    let groups = (0..5).map(|group| ContextGroup { views: vec![2 * group, 2 * group + 1], ..ContextGroup::of_all(0) });
-    let scene = Scene {
-        context_frames: (0..10).collect(),
-        groups: groups.collect(),
-        token_ids: (0..60).collect(),
-        tokens: (0..60 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect(),
-        model: config.clone(),
-        renderer_hash: renderer_hash(&renderer, &config),
-        context: context.clone(),
-        ..scene()
-    };
-    let rules = SelectionPreset::Paper.rules();
-    let mut renderer = SceneRenderer::new(&scene, renderer, rules, &device).unwrap();
-    assert_eq!((scene.max_render_tokens(), renderer.max_render_tokens()), (48, 48));
-    for (view, near) in [(context[0], 0..48_u32), (context[9], 12..60)] {
-        let mut tokens = |count: usize| {
-            renderer.reset();
-            renderer.render(&[view, view], 16, 24, count).unwrap().remove(0).tokens.unwrap()
-        };
-        assert_eq!(tokens(60), near.clone().collect::<Vec<_>>());
-        let some = tokens(20);
-        assert!(some.len() == 20 && some.iter().all(|token| near.contains(token)), "{some:?}");
-    }
-}
-
 /// Returns the middle of a frame by bicubic convolution of an image, `scale` pixels of the image per pixel: an independent
 /// reference in f64, with the filter of Pillow's BICUBIC.
 fn resampled(image: &[f32], [rows, columns]: [usize; 2], scale: f64, [height, width]: [usize; 2]) -> Vec<f32> {
@@ -204,7 +138,6 @@ fn resampled(image: &[f32], [rows, columns]: [usize; 2], scale: f64, [height, wi
     (0..height * width * 3).map(|i| pixel(i / 3 / width, i / 3 % width, i % 3)).collect()
 }
 
-/// Returns the middle columns of a frame.
 fn middle(frame: &[f32], width: usize, columns: usize) -> Vec<f32> {
     let left = (width - columns) / 2;
     frame.chunks(width * 3).flat_map(|row| &row[left * 3..][..columns * 3]).copied().collect()
@@ -239,7 +172,7 @@ fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
     for (encoding, grids) in [
         (CameraEncoding::Plucker, PatchGrids::One),
         (CameraEncoding::Gta, PatchGrids::Two),
-        (CameraEncoding::Prope, PatchGrids::Four),
+        (CameraEncoding::Gta, PatchGrids::Four),
     ] {
         let config = ModelConfig { patch_grids: grids, ..encoded(encoding) };
         let renderer = Network::new(&config, 3, &device).renderer;
@@ -306,4 +239,26 @@ fn a_scene_accepts_only_its_own_renderer() {
         |model| (model.dim, model.feed_forward_dim, model.num_renderer_blocks) = (1 << 16, 1 << 18, 1 << 10),
         "the scene's renderer needs at least 14074",
     );
+}
+
+#[test]
+fn shares_of_groups_add_up_and_change_continuously() {
+    assert_eq!(group_shares(&[0.7]), [(0, 1.0)]);
+    assert_eq!(group_shares(&[0.9, 0.2]), [(1, 1.0)], "far beyond the nearest");
+    assert_eq!(group_shares(&[0.5, 0.5]), [(0, 0.5), (1, 0.5)]);
+    assert_eq!(group_shares(&[0.5; 4]), [(0, 1.0)], "no room before the next after the most groups");
+    let share = |distances: &[f64], group: usize| {
+        group_shares(distances).iter().find(|(other, _)| *other == group).map_or(0.0, |(_, share)| *share)
+    };
+    // Two groups swap places, a third comes and goes. A share falls from 1 to 0 over a difference in distance of 0.05 to
+    // 0.15, which a step changes by 0.002: the share changes by at most 0.04.
+    for step in 0..1000 {
+        let at = |step: i32| [f64::from(step) * 1e-3, 1.0 - f64::from(step) * 1e-3, 0.4, 0.45];
+        let sum: f64 = (0..4).map(|group| share(&at(step), group)).sum();
+        assert!((sum - 1.0).abs() < 1e-12, "step {step}: {sum}");
+        for group in 0..4 {
+            let jump = (share(&at(step), group) - share(&at(step + 1), group)).abs();
+            assert!(jump < 0.05, "group {group} jumps by {jump} at step {step}");
+        }
+    }
 }

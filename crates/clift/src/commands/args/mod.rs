@@ -1,7 +1,6 @@
 //! Arguments that several commands share: `parse` (values), `shared_args` (options), `splits` (data sets), `model_args` (a
-//! model with its data), `adapter` (name of the GPU).
+//! model with its data).
 
-pub(crate) mod adapter;
 pub(crate) mod model_args;
 pub(crate) mod parse;
 pub(crate) mod shared_args;

@@ -8,28 +8,15 @@ use clift_data::{
 };
 use clift_model::{ModelConfig, ModelPath, SHIPPED_MODEL, TrainedModel, is_shipped};
 use clift_scene::{ContextChoice, photo_size};
-use clift_train::{Config, NewestCheckpoint, Override, TrainError};
+use clift_train::{Config, NewestCheckpoint, TrainError};
 
 use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
-use crate::output::counter::ScanCounter;
-use crate::output::stdout::{print_note, print_warning};
+use crate::output::counter::scan_counter;
+use crate::output::stdout::print_note;
 
 /// Environment variable with the path of another model to use where none is named.
 const MODEL_VARIABLE: &str = "CLIFT_MODEL";
-
-/// Relative difference in pixels per angle up to which images count as those of the training.
-const MAX_DENSITY_DIFFERENCE: f64 = 0.05;
-
-/// The part of a photo that the network sees.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum PhotoCrop {
-    /// Nearly all of it, if the network was trained with several image sizes.
-    #[default]
-    Whole,
-    /// The middle, with the proportions of the images of the training.
-    Trained,
-}
 
 /// A trained model, its config, and the folder of scenes that replaces the data of the config.
 pub struct ModelArgs {
@@ -37,9 +24,8 @@ pub struct ModelArgs {
     pub given: PathBuf,
     pub path: ModelPath,
     pub config: Config,
-    overrides: Vec<Override>,
-    /// Width and height of the images that the network was trained on.
-    trained_size: [usize; 2],
+    /// Keys that `--set` gives.
+    set_keys: Vec<String>,
     /// Data set or capture beside the model.
     pub folder: Option<PathBuf>,
     /// The weights of a run in training, in place of those of `path`.
@@ -75,10 +61,14 @@ impl ModelArgs {
     }
 
     fn read(model: &Path, path: ModelPath, folder: Option<&Path>, args: &ConfigArgs) -> anyhow::Result<Self> {
-        let read = |set: &[String]| read_config(&path.dir.join("config.toml"), set, |_| Ok(()));
-        let (mut config, overrides) = read(&args.set)?;
+        let (mut config, set_keys) = read_config(&path.dir.join("config.toml"), &args.set, |_| Ok(()))?;
         check_network(&config.model, &path)?;
-        let trained_size = image_size(&if overrides.is_empty() { config.clone() } else { read(&[])?.0 });
+        if let Some(key) = set_keys.iter().find(|key| ["data.width", "data.height"].contains(&key.as_str())) {
+            usage_bail!(
+                "--set {key}: the network makes noise of images of another size than in training; remove the override, and \
+                 choose the size of frames with `clift render --size`"
+            );
+        }
         config.device = args.device.unwrap_or(config.device);
         let folder = folder.map(Path::to_path_buf);
         if folder.is_some() {
@@ -86,83 +76,46 @@ impl ModelArgs {
             config.data.root.clone_from(&folder);
         }
         config.validate()?;
-        Ok(Self { given: model.into(), path, config, overrides, trained_size, folder, checkpoint: None })
+        Ok(Self { given: model.into(), path, config, set_keys, folder, checkpoint: None })
     }
 
     /// Opens one split of the folder, or of the data of the config.
     pub fn open_data(&self, split: Split) -> anyhow::Result<OpenedSource> {
-        let opened = self.open_any(split)?;
-        self.check_density(opened.source.as_ref())?;
-        Ok(opened)
-    }
-
-    fn open_any(&self, split: Split) -> anyhow::Result<OpenedSource> {
         let Some(folder) = &self.folder else {
-            let mut counter = ScanCounter::default();
-            return Ok(open_dataset(&self.config.data, split, &mut |done, total| counter.set(done, total))?);
+            return Ok(open_dataset(&self.config.data, split, &mut scan_counter())?);
         };
         // The `data.files` keys of a run describe its own data: they apply only if `--set` sets one of them.
-        let has_files = self.overrides.iter().any(|change| change.key.starts_with("data.files"));
+        let has_files = self.set_keys.iter().any(|key| key.starts_with("data.files"));
         let files = if has_files { self.config.data.files.clone() } else { FileOptions::default() };
         // The filters are for training scenes; the user chooses this scene by its key.
         let background = self.config.data.background;
-        let min_size = image_size(&self.config);
+        let min_size = [self.config.data.width, self.config.data.height];
         let options = SourceOptions { files, background, min_size, ..SourceOptions::default() };
-        let opened = open_source(&DatasetRoot::find(folder)?, split, &options)?;
+        let opened = open_source(&DatasetRoot::find(folder)?, split, &options, &mut scan_counter())?;
         if opened.report.has_content() {
             print_note(&format!("{}: {}", folder.display(), opened.report));
         }
         Ok(opened)
     }
 
-    /// Refuses images of another number of pixels per angle than those of the training, of which the network makes noise.
-    /// The first image stands for all.
-    fn check_density(&self, source: &dyn SceneSource) -> anyhow::Result<()> {
-        let (size, trained) = (image_size(&self.config), self.trained_size);
-        if size == trained || source.num_scenes() == 0 {
-            return Ok(());
-        }
-        let image = source.image_size(0, 0)?;
-        // An image is reduced until it just covers the size.
-        let scale = |size: [usize; 2]| (0..2).map(|side| size[side] as f64 / image[side] as f64).fold(0.0, f64::max);
-        let words = |[width, height]: [usize; 2]| format!("{width} x {height}");
-        let (density, patch) = (scale(size) / scale(trained), self.config.model.patch_size);
-        if (density - 1.0).abs() > MAX_DENSITY_DIFFERENCE {
-            let widest = image.map(|side| (side as f64 * scale(trained) / patch as f64) as usize * patch);
-            usage_bail!(
-                "--set data.width, data.height: at {} pixels, images of {} have {density:.2} times as many pixels per \
-                 angle as the images of {} that the network was trained on, from which it renders noise; write at most \
-                 {}, and choose the size of frames with `clift render --size`",
-                words(size),
-                words(image),
-                words(trained),
-                words(widest)
-            );
-        }
-        let (size, trained) = (words(size), words(trained));
-        print_warning(format!("the network was trained on images of {trained}; images of {size} may lose quality"));
-        Ok(())
-    }
-
     /// Returns the preparation of the views of a scene: a network that was trained with several image sizes sees whole photos
     /// of a folder, others see photos cropped to the size of the training.
-    pub fn clip_options(&self, source: &dyn SceneSource, scene: usize, crop: PhotoCrop) -> anyhow::Result<ClipOptions> {
-        let (options, stage1) = (self.config.data.clip_options(), &self.config.stage1);
-        let is_set = image_size(&self.config) != self.trained_size;
-        if self.folder.is_none() || is_set || stage1.further_sizes.is_empty() || crop == PhotoCrop::Trained {
+    pub fn clip_options(&self, source: &dyn SceneSource, scene: usize) -> anyhow::Result<ClipOptions> {
+        let options = self.config.data.clip_options();
+        if self.folder.is_none() || self.config.stage1.further_sizes.is_empty() {
             return Ok(options);
         }
-        let [width, height] = photo_size(self.trained_size, self.config.model.patch_size, source.image_size(scene, 0)?);
+        let (trained, photo) = ([options.width, options.height], source.image_size(scene, 0)?);
+        let [width, height] = photo_size(trained, self.config.model.patch_size, photo);
         Ok(ClipOptions { width, height, ..options })
     }
 
-    /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder. A
-    /// number of groups chooses groups in both cases.
-    pub fn context(&self, num_groups: Option<usize>) -> ContextChoice {
+    /// Returns the default context views of a scene: as many as in training, or those of a captured scene of the folder.
+    pub fn context(&self) -> ContextChoice {
         let trained = self.config.data.views.max_context;
-        match (&self.folder, num_groups) {
-            (None, None) => ContextChoice::Spread(trained),
-            _ => ContextChoice::for_capture(&self.config.model, trained, num_groups),
+        match self.folder {
+            None => ContextChoice::Spread(trained),
+            Some(_) => ContextChoice::for_capture(&self.config.model, trained),
         }
     }
 
@@ -174,11 +127,6 @@ impl ModelArgs {
             None => Ok(TrainedModel::open_with(&self.path, &self.config.model, &device)?),
         }
     }
-}
-
-/// Returns the width and the height of the images that a config reads.
-fn image_size(config: &Config) -> [usize; 2] {
-    [config.data.width, config.data.height]
 }
 
 /// Refuses another network than that of the weights. Tensor shapes do not determine the number of heads nor the camera

@@ -2,9 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::ImageEncoding;
 use clift_model::DeviceName;
-use clift_train::{Config, Override, TrainError, parse_config, read_checked_config};
+use clift_train::{Config, TrainError, parse_config, read_checked_config};
 use serde::Serialize;
 
 use crate::commands::args::parse::parse_output;
@@ -55,25 +54,21 @@ impl ConfigArgs {
     }
 }
 
-/// Reads a config, applies the overrides of `--set`, checks the values and prints what changed. Where a path of [`CONFIGS`] does
-/// not exist, the config inside the program is read.
+/// Reads a config, applies the overrides of `--set` and checks the values. Returns also the keys that were set. Where a path
+/// of [`CONFIGS`] does not exist, the config inside the program is read.
 pub fn read_config(
     path: &Path,
     set: &[String],
     check: impl FnOnce(&Config) -> Result<(), TrainError>,
-) -> anyhow::Result<(Config, Vec<Override>)> {
+) -> anyhow::Result<(Config, Vec<String>)> {
     let shipped = || CONFIGS.iter().find(|(name, _)| path == Path::new(name) && !path.exists());
-    let (config, overrides) = match shipped() {
+    Ok(match shipped() {
         Some((_, text)) => {
             print_note(&format!("config: {}, which ships with clift", path.display()));
             parse_config(path, text, set, check)?
         }
         None => read_checked_config(path, set, check)?,
-    };
-    for change in &overrides {
-        print_note(&change.to_string());
-    }
-    Ok((config, overrides))
+    })
 }
 
 #[derive(Debug, clap::Args)]
@@ -112,28 +107,6 @@ impl JsonFile {
         let Some(file) = &self.0 else { return Ok(()) };
         file.write_json(results)?;
         print_result(&format!("results: {}", file.path().display()))
-    }
-}
-
-/// Options of written scenes.
-#[derive(Debug, clap::Args)]
-pub struct ChunkArgs {
-    /// Set the size at which a chunk is closed, in MB of images
-    #[arg(long, value_name = "M", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=4000))]
-    pub chunk_mb: u64,
-    /// Encode images as JPEG of this quality, 1 to 100 [default: lossless PNG]
-    #[arg(long, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
-    pub quality: Option<u8>,
-}
-
-impl ChunkArgs {
-    /// Returns the bytes of images at which a chunk is closed.
-    pub fn target_bytes(&self) -> u64 {
-        self.chunk_mb * 1_000_000
-    }
-
-    pub fn encoding(&self) -> ImageEncoding {
-        self.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg)
     }
 }
 

@@ -8,6 +8,7 @@ use clift_train::parse_config;
 use serde::{Deserialize, Serialize};
 
 use crate::commands::args::parse::parse_input;
+use crate::output::counter::scan_counter;
 use crate::output::stdout::print_note;
 
 /// The config keys that `--set` accepts for a data set: `data.files.*`.
@@ -89,7 +90,8 @@ pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::
     let present = if is_listed { splits.list().to_vec() } else { present_splits(&root, splits) };
     let mut sources = Vec::new();
     for split in present {
-        let mut opened = open_source(&root, split, &SourceOptions { files: files.clone(), ..read_all_options() })?;
+        let options = SourceOptions { files: files.clone(), ..read_all_options() };
+        let mut opened = open_source(&root, split, &options, &mut scan_counter())?;
         let is_whole = opened.shares_scenes;
         if is_whole {
             let source = &opened.source;
@@ -141,23 +143,20 @@ mod tests {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("list");
-        let opened = |keys: Option<&str>, splits: Splits| {
-            let test_scenes = keys.map(|keys| {
-                std::fs::write(&path, keys).unwrap();
-                path.clone()
-            });
-            let sources = open_splits(&root, splits, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
+        let opened = |keys: &str, splits: Splits| {
+            std::fs::write(&path, keys).unwrap();
+            let files = FileOptions { test_scenes: Some(path.clone()), ..FileOptions::default() };
+            let sources = open_splits(&root, splits, &files).unwrap();
             let counts = sources.iter().map(|source| (source.name(), source.opened.source.num_scenes()));
             counts.collect::<Vec<_>>()
         };
-        let all = opened(None, Splits::Both);
+        let all = opened("", Splits::Both);
         assert_eq!((all.len(), &all[0].0[..]), (1, "scenes"));
-        assert_eq!(opened(Some(""), Splits::Both), all);
-        let test = open_source(&DatasetRoot::find(&root).unwrap(), Split::Test, &SourceOptions::default()).unwrap();
+        let root = DatasetRoot::find(&root).unwrap();
+        let test = open_source(&root, Split::Test, &SourceOptions::default(), &mut |_, _| ()).unwrap();
         let key = test.source.key(0);
         let (train, test) = (("train".to_owned(), all[0].1 - 1), ("test".to_owned(), 1));
-        assert_eq!(opened(Some(key), Splits::Both), [train.clone(), test.clone()]);
-        assert_eq!(opened(Some(key), Splits::Train), [train]);
-        assert_eq!(opened(Some(key), Splits::Test), [test]);
+        assert_eq!(opened(key, Splits::Both), [train, test.clone()]);
+        assert_eq!(opened(key, Splits::Test), [test]);
     }
 }

@@ -1,17 +1,12 @@
 //! `clift data check`.
 
-use std::path::PathBuf;
-
-use clift_data::{
-    CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, skipped_scenes,
-};
-use clift_eval::{distinct_file_name, table};
+use clift_data::{SceneCheck, Split, Verdict, check_scene, note_skipped_frames, plural, skipped_scenes};
+use clift_eval::table;
 use serde::Serialize;
 
 use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
-use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::visible::visible_line;
 
@@ -23,7 +18,6 @@ struct Row {
     check: SceneCheck,
 }
 
-/// Content of `--json`.
 #[derive(Debug, Serialize)]
 struct Report {
     scenes: Vec<Row>,
@@ -41,7 +35,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let json = args.json.open(&[&args.source.dir])?;
     let mut report = Report { scenes: Vec::new(), notes: Vec::new() };
     for split in args.source.open(args.split)? {
-        check_split(&split, args, &mut report)?;
+        check_split(&split, args.scenes, &mut report);
     }
     print_result(&report_text(&report))?;
     json.write(&report)?;
@@ -55,37 +49,21 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn check_split(split: &SplitSource, args: &CheckArgs, report: &mut Report) -> anyhow::Result<()> {
+fn check_split(split: &SplitSource, most: Option<usize>, report: &mut Report) {
     let (source, skips) = (&split.opened.source, &split.opened.report);
     for note in &skips.notes {
         print_note(&format!("note: {note}"));
     }
     report.notes.extend_from_slice(&skips.notes);
     report.scenes.extend(skipped_scenes(skips).into_iter().map(|check| Row { split: split.split, check }));
-    let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
-    let image_file = |folder: &PathBuf, scene: usize| {
-        let path = folder.join(image_name(split.split, source.key(scene)));
-        OutputFile::new(&path, args.json.force, &[&args.source.dir])
-    };
-    let all = args.images.iter().flat_map(|folder| (0..num_scenes).map(move |scene| image_file(folder, scene)));
-    let images = all.collect::<anyhow::Result<Vec<OutputFile>>>()?;
+    let num_scenes = source.num_scenes().min(most.unwrap_or(usize::MAX));
     let mut counter = Counter::new(&split.name(), num_scenes as u64);
     for scene in 0..num_scenes {
-        let CheckedScene { mut check, image } = check_scene(source.as_ref(), scene);
+        let mut check = check_scene(source.as_ref(), scene);
         note_skipped_frames(skips, &mut check);
-        if let (Some(file), Some(image)) = (images.get(scene), image) {
-            file.write(&encode_png(&image)?)?;
-        }
         report.scenes.push(Row { split: split.split, check });
         counter.set(scene as u64 + 1);
     }
-    Ok(())
-}
-
-/// Returns `test-KEY.png`, with the key as a file name of its own.
-fn image_name(split: Option<Split>, key: &str) -> String {
-    let key = distinct_file_name(key);
-    split.map_or_else(|| format!("{key}.png"), |split| format!("{split}-{key}.png"))
 }
 
 fn report_text(report: &Report) -> String {
@@ -132,54 +110,4 @@ pub struct CheckArgs {
     pub scenes: Option<usize>,
     #[command(flatten)]
     pub json: JsonArg,
-    /// Write an image per scene: two frames with epipolar lines
-    #[arg(long, value_name = "OUT")]
-    pub images: Option<PathBuf>,
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn table_has_rows_and_reasons() {
-        let good = SceneCheck {
-            key: "a".into(),
-            verdict: Verdict::Ok,
-            num_frames: 36,
-            epipolar_px: Some(0.312),
-            image_size: Some([576, 320]),
-            fov_deg: Some(93.04),
-            ..SceneCheck::default()
-        };
-        let reasons = vec!["it has no frames".to_owned()];
-        let notes = vec!["so much".into()];
-        let bad = SceneCheck { key: "b".into(), verdict: Verdict::Flagged, reasons, notes, ..SceneCheck::default() };
-        let small = SceneCheck { key: "c".into(), num_frames: 3, ..SceneCheck::default() };
-        let report = Report {
-            scenes: vec![
-                Row { split: Some(Split::Train), check: good },
-                Row { split: None, check: bad },
-                Row { split: None, check: small },
-            ],
-            notes: Vec::new(),
-        };
-        let expected = "\
-scene    frames  size     field of view  epipolar
-train/a  36      576x320  93.0 deg       0.31 px   ok
-b        0       -        -              -         FLAGGED
-c        3       -        -              -         not compared
-
-b: it has no frames
-b: note: so much
-
-3 scenes, 1 ok, 1 flagged, 1 not compared with the images";
-        assert_eq!(report_text(&report), expected);
-    }
-
-    #[test]
-    fn image_name_stays_in_the_folder() {
-        assert_eq!(image_name(Some(Split::Test), "00ff"), "test-00ff.png");
-        assert!(image_name(None, "../1K/a b").starts_with("_._1K_a_b-"));
-    }
 }

@@ -6,13 +6,16 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 
 use crate::commands::data::tool::Tool;
-use crate::output::counter::Counter;
+use crate::output::stdout::print_note;
 
 /// Frames on each side that a frame of a sequence is matched with, and as many at distances of powers of two.
 const OVERLAP: usize = 15;
 
-/// Settings for 20 to 200 photos.
-pub(crate) struct Settings {
+/// A photogrammetry project of COLMAP in a folder of its own, with settings for 20 to 200 photos.
+pub(crate) struct Colmap<'a> {
+    pub tool: Tool<'a>,
+    pub images: &'a Path,
+    pub folder: &'a Path,
     /// Whether all photos have one size, and so one camera.
     pub single_camera: bool,
     /// Whether a photo is matched with its neighbours only, not with all others.
@@ -20,21 +23,11 @@ pub(crate) struct Settings {
     pub use_gpu: bool,
 }
 
-/// A photogrammetry project of COLMAP in a folder of its own.
-pub(crate) struct Colmap<'a> {
-    pub tool: Tool<'a>,
-    pub images: &'a Path,
-    pub folder: &'a Path,
-    pub num_images: usize,
-    pub settings: Settings,
-}
-
 impl Colmap<'_> {
     /// Finds features in every photo. Photos that the database has are kept.
     pub fn extract_features(&self) -> anyhow::Result<()> {
-        let Settings { single_camera, use_gpu, .. } = self.settings;
-        let [single, gpu] = [single_camera, use_gpu].map(|on| if on { "1" } else { "0" });
-        let model = if single_camera { "OPENCV" } else { "SIMPLE_RADIAL" };
+        let [single, gpu] = [self.single_camera, self.use_gpu].map(|on| if on { "1" } else { "0" });
+        let model = if self.single_camera { "OPENCV" } else { "SIMPLE_RADIAL" };
         let options = [
             (&["ImageReader.single_camera"][..], single),
             (&["ImageReader.camera_model"], model),
@@ -47,14 +40,13 @@ impl Colmap<'_> {
 
     /// Matches the features. Pairs that the database has are kept.
     pub fn match_features(&self) -> anyhow::Result<()> {
-        let gpu = if self.settings.use_gpu { "1" } else { "0" };
+        let gpu = if self.use_gpu { "1" } else { "0" };
         let gpu = (&["SiftMatching.use_gpu", "FeatureMatching.use_gpu"][..], gpu);
-        if self.settings.sequential {
+        if self.sequential {
             let overlap = OVERLAP.to_string();
             self.run("sequential_matcher", "matches", &[], &[gpu, (&["SequentialMatching.overlap"], &overlap)])
         } else {
-            // Small blocks, for progress.
-            self.run("exhaustive_matcher", "matches", &[], &[gpu, (&["ExhaustiveMatching.block_size"], "8")])
+            self.run("exhaustive_matcher", "matches", &[], &[gpu])
         }
     }
 
@@ -100,64 +92,7 @@ impl Colmap<'_> {
                 args.extend([format!("--{name}").into(), OsString::from(value)]);
             }
         }
-        let mut counter: Option<Counter> = None;
-        self.tool.run(&args, |line| {
-            if let Some((done, total)) = progress(line) {
-                let total = total.unwrap_or(self.num_images as u64);
-                counter.get_or_insert_with(|| Counter::new(noun, total)).set(done);
-            }
-        })
-    }
-}
-
-/// Returns what a line of COLMAP reports as done, and of how many if it says so: files of the extractor, pairs of blocks or
-/// images of the matchers, registered images of the mapper.
-fn progress(line: &str) -> Option<(u64, Option<u64>)> {
-    let number = |text: &str| text.trim_matches(|c: char| !c.is_ascii_digit()).parse::<u64>().ok();
-    let between = |open: char, close: char| Some(line.rsplit_once(open)?.1.split_once(close)?.0);
-    if line.contains("Registering image #") {
-        let text = between('(', ')')?;
-        return Some((number(text.rsplit('=').next()?)?, None));
-    }
-    if !["Processed file [", "Matching block [", "Processing block [", "Matching image [", "Processing image ["]
-        .iter()
-        .any(|start| line.contains(start))
-    {
-        return None;
-    }
-    let mut done_and_total = Vec::new();
-    for pair in between('[', ']')?.split(',') {
-        let (done, total) = pair.split_once('/')?;
-        done_and_total.push((number(done)?, number(total)?));
-    }
-    match done_and_total[..] {
-        [(done, total)] => Some((done, Some(total))),
-        [(row, rows), (column, columns)] => {
-            Some((row.saturating_sub(1).saturating_mul(columns).saturating_add(column), rows.checked_mul(columns)))
-        }
-        _ => None,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn progress_is_read_from_every_generation_of_colmap() {
-        for (line, expected) in [
-            ("Processed file [7/10]", Some((7, Some(10)))),
-            ("I20250101 10:00:00.1 12 feature_extraction.cc:254] Processed file [1/3]", Some((1, Some(3)))),
-            ("Matching block [2/3, 1/3] in 8.373s", Some((4, Some(9)))),
-            ("I20250101 10:00:00.1 12 pairing.cc:168] Processing block [3/3, 3/3]", Some((9, Some(9)))),
-            ("Matching image [3/20] in 0.2s", Some((3, Some(20)))),
-            ("Registering image #5 (13)", Some((13, None))),
-            ("Registering image #5 (num_reg_frames=13)", Some((13, None))),
-            ("  => Image sees 574 / 2259 points", None),
-            ("Processed file [?/10]", None),
-            ("Processed file", None),
-        ] {
-            assert_eq!(progress(line), expected, "{line}");
-        }
+        print_note(&format!("COLMAP: {noun}"));
+        self.tool.run(&args)
     }
 }

@@ -3,7 +3,6 @@
 use clap::Subcommand;
 
 use crate::commands::data::check::CheckArgs;
-use crate::commands::data::convert::ConvertArgs;
 use crate::commands::data::index::IndexArgs;
 use crate::commands::data::info::InfoArgs;
 use crate::commands::data::poses::PosesArgs;
@@ -21,13 +20,12 @@ pub enum DataCommand {
 Examples:
   clift data synth /data/rooms
   clift data synth /data/rooms --scenes 2000 --frames 24 --size 64x64 --seed 7
-  clift data synth /data/rooms --split test --scenes 50 --quality 95
-  clift data synth /data/rooms --set specular=0.8 --set 'num_objects=[4, 8]'
+  clift data synth /data/rooms --split test --scenes 50
+  clift data synth /data/rooms --set specular=0.8 --set path_length=2
   clift data synth /data/real --look real --frames 32 --size 64x64
 
 Keys of --set for rooms, as in [data.synthetic] of a config: fov_deg,
-room_half_size, num_objects, path_length, texture_frequency, specular,
-samples_per_pixel.")]
+path_length, texture_frequency, plain_share, specular, samples_per_pixel.")]
     Synth(SynthArgs),
     /// Find the camera poses of photos or a film with COLMAP
     ///
@@ -41,7 +39,7 @@ Examples:
   clift data poses attic.mp4 -o captures/attic --frames 150
   clift data poses photos/walk -o captures/walk --matching neighbours")]
     Poses(PosesArgs),
-    /// Describe a data set or an evaluation index
+    /// Describe a data set
     ///
     /// Recognises every layout: chunks, files per scene, RealEstate10K text files, DL3DV folders, captures with
     /// transforms.json or a COLMAP model. Prints per split: scenes, frames (smallest / median / largest), image size,
@@ -59,7 +57,7 @@ Examples:
     #[command(after_help = "\
 Examples:
   clift data check /data/re10k --scenes 20
-  clift data check captures/fox --images fox-lines --json fox.json")]
+  clift data check captures/fox --json fox.json")]
     Check(CheckArgs),
     /// Create an evaluation index from pairs of overlapping frames
     ///
@@ -71,17 +69,4 @@ Examples:
   clift data index /data/re10k -o index.json
   clift data index captures -o index.json --distance 6..20 --context 4 --targets 6")]
     Index(IndexArgs),
-    /// Convert any layout to pixelSplat chunks or to one file per scene
-    ///
-    /// Writes the splits of DIR to OUT/train and OUT/test. A data set without splits, such as captures, becomes OUT itself,
-    /// unless `data.files.test_scenes` divides it. Image files are copied byte by byte, unless their lens distortion is
-    /// removed or --max-size reduces them. The files of a split appear when all are complete. Exits with 1 if an image is
-    /// unreadable or no scene of a split can be converted.
-    #[command(after_help = "\
-Examples:
-  clift data convert captures/fox fox-chunks --to chunks --max-size 512 --quality 95
-  clift data convert /data/re10k-txt /data/re10k --to chunks --split test
-  clift data convert /data/re10k /data/re10k-scenes --to scenes
-  clift data convert /data/dl3dv /data/dl3dv-chunks --to chunks --set data.files.test_scenes=benchmark.txt")]
-    Convert(ConvertArgs),
 }

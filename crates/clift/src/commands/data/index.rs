@@ -15,7 +15,6 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
         num_targets: args.targets,
         distance: args.distance,
         min_overlap: args.overlap,
-        context_targets: args.context_targets,
         seed: args.seed,
     };
     options.validate()?;
@@ -29,7 +28,7 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     let file = if report.num_used() > 0 { args.out.display().to_string() } else { "no file written".into() };
     print_result(&format!("{} of {} with views: {file}", plural(report.num_used(), "scene"), report.num_scenes))?;
     for (reason, number) in report.counts() {
-        print_result(&format!("null: {number} {reason}"))?;
+        print_result(&format!("without views: {} {reason}", plural(number, "scene")))?;
     }
     if report.num_used() == 0 {
         let [near, far] = options.distance;
@@ -63,9 +62,6 @@ pub struct IndexArgs {
     /// Minimum overlap of the first and the last context
     #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
     pub overlap: f64,
-    /// Allow contexts as targets, as published indices do
-    #[arg(long)]
-    pub context_targets: bool,
     /// Seed of the sampled frames
     #[arg(long, value_name = "S", default_value_t = 123)]
     pub seed: u64,

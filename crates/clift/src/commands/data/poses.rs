@@ -12,20 +12,17 @@ use serde::{Deserialize, Serialize};
 use crate::commands::args::shared_args::JsonArg;
 use crate::commands::args::splits::{SourceArgs, Splits};
 use crate::commands::data::check::{self, CheckArgs};
-use crate::commands::data::colmap::{Colmap, Settings};
+use crate::commands::data::colmap::Colmap;
 use crate::commands::data::tool::Tool;
 use crate::exit_code::{Interrupted, usage_bail};
 use crate::interrupt::{self, Ending};
-use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result, print_warning};
 
-/// Fewest photos of a model.
 const MIN_PHOTOS: usize = 3;
 /// Most photos that are matched each with each by default: 5,000 pairs.
 const MAX_EXHAUSTIVE: usize = 100;
 /// Longest side of the frames of a film, in pixels.
 const FRAME_SIDE: usize = 1920;
-/// Names in a message.
 const MAX_NAMES: usize = 3;
 
 /// The photos or film from which a capture is made: another one must not continue it.
@@ -36,7 +33,6 @@ struct Origin {
     frames: Option<usize>,
 }
 
-/// The folders of a capture.
 struct Capture {
     folder: PathBuf,
     /// COLMAP's database and log, and [`Origin`].
@@ -75,7 +71,6 @@ pub fn run(args: &PosesArgs) -> anyhow::Result<()> {
         split: Splits::Both,
         scenes: None,
         json: JsonArg { path: None, force: false },
-        images: None,
     });
     let name = args.out.file_name().map_or_else(|| "capture".into(), |name| name.to_string_lossy().into_owned());
     let (folder, scene) = (quoted(&args.out.to_string_lossy()), quoted(&format!("{name}.clift")));
@@ -160,13 +155,11 @@ fn list_photos(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(photos)
 }
 
-/// Copies the photos that the capture does not have.
 fn copy_photos(from: &Path, photos: &[PathBuf], to: &Path, stop: &AtomicBool) -> anyhow::Result<()> {
     if is_same(from, to) {
         return Ok(());
     }
-    let mut counter = Counter::new("photos", photos.len() as u64);
-    for (index, name) in photos.iter().enumerate() {
+    for name in photos {
         let (source, target) = (from.join(name), to.join(name));
         let copying = || format!("copying {} to {}", source.display(), target.display());
         if !target.exists() {
@@ -174,7 +167,6 @@ fn copy_photos(from: &Path, photos: &[PathBuf], to: &Path, stop: &AtomicBool) ->
             let bytes = std::fs::read(&source).with_context(copying)?;
             replace_file(&target, &bytes).with_context(copying)?;
         }
-        counter.set(index as u64 + 1);
         if stop.load(Ordering::SeqCst) {
             return Err(Interrupted.into());
         }
@@ -182,7 +174,6 @@ fn copy_photos(from: &Path, photos: &[PathBuf], to: &Path, stop: &AtomicBool) ->
     Ok(())
 }
 
-/// Extracts frames of a film at equal distances.
 fn extract_frames(args: &PosesArgs, capture: &Capture, ffprobe: &Tool<'_>, ffmpeg: &Tool<'_>) -> anyhow::Result<()> {
     if capture.images.exists() {
         return Ok(());
@@ -206,11 +197,10 @@ fn extract_frames(args: &PosesArgs, capture: &Capture, ffprobe: &Tool<'_>, ffmpe
     words.push(film.into());
     words.extend(["-vf", &filter, "-frames:v", &number, "-q:v", "2"].map(Into::into));
     words.push(unfinished.join("frame_%05d.jpg").into());
-    ffmpeg.run(&words, |_| {})?;
+    ffmpeg.run(&words)?;
     publish_folder(&unfinished, &capture.images).with_context(|| format!("writing {}", capture.images.display()))
 }
 
-/// Runs COLMAP and keeps its largest model.
 fn find_poses(args: &PosesArgs, capture: &Capture, is_film: bool, tool: Tool<'_>) -> anyhow::Result<()> {
     let photos = list_photos(&capture.images)?;
     let num_images = photos.len();
@@ -226,8 +216,8 @@ fn find_poses(args: &PosesArgs, capture: &Capture, is_film: bool, tool: Tool<'_>
     };
     let pairs = if sequential { "neighbours in the order of the names" } else { "each with each" };
     print_note(&format!("COLMAP: {}, matched {pairs}; log: {}", plural(num_images, "photo"), tool.log.display()));
-    let settings = Settings { single_camera, sequential, use_gpu: args.gpu };
-    let colmap = Colmap { tool, images: &capture.images, folder: &capture.work, num_images, settings };
+    let (images, folder, use_gpu) = (&capture.images, &capture.work, args.gpu);
+    let colmap = Colmap { tool, images, folder, single_camera, sequential, use_gpu };
     colmap.extract_features()?;
     colmap.match_features()?;
     let models = capture.work.join(format!("{TEMPORARY}models"));
@@ -273,16 +263,4 @@ pub struct PosesArgs {
     /// Let COLMAP use a GPU; it needs CUDA or a screen
     #[arg(long)]
     pub gpu: bool,
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn words_are_quoted_for_a_shell_where_needed() {
-        for (word, expected) in [("a/b-1.clift", "a/b-1.clift"), ("my attic", "'my attic'"), ("it's", "'it'\\''s'")] {
-            assert_eq!(quoted(word), expected);
-        }
-    }
 }

@@ -1,4 +1,4 @@
-//! Runs a program of other people: its output into a log file, its progress to the terminal.
+//! Runs a program of other people: its output into a log file.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{File, OpenOptions};
@@ -13,18 +13,15 @@ use anyhow::{Context, bail};
 
 use crate::exit_code::Interrupted;
 
-/// Lines of the log in the error of a program that failed.
 const NUM_LAST_LINES: usize = 5;
 const POLL: Duration = Duration::from_millis(200);
 
-/// A program on the PATH.
 pub(crate) struct Tool<'a> {
     pub name: &'static str,
     /// Debian's package with the program.
     pub package: &'static str,
     /// Receives the command lines and the output.
     pub log: PathBuf,
-    /// Ends the program.
     pub stop: &'a AtomicBool,
 }
 
@@ -35,10 +32,10 @@ impl Tool<'_> {
         Ok(String::from_utf8_lossy(&self.started(output)?.stdout).into_owned())
     }
 
-    /// Runs the program to its end; `on_line` gets every line of its output.
+    /// Runs the program to its end.
     ///
     /// Where this process is killed, the pipe closes, so that the program ends at its next line.
-    pub fn run(&self, args: &[OsString], mut on_line: impl FnMut(&str)) -> anyhow::Result<()> {
+    pub fn run(&self, args: &[OsString]) -> anyhow::Result<()> {
         let logging = || format!("writing {}", self.log.display());
         let mut log = OpenOptions::new().create(true).append(true).open(&self.log).with_context(logging)?;
         let words: Vec<_> = args.iter().map(|word| word.to_string_lossy()).collect();
@@ -56,10 +53,7 @@ impl Tool<'_> {
         });
         loop {
             match lines.recv_timeout(POLL) {
-                Ok(line) => {
-                    writeln!(log, "{line}").with_context(logging)?;
-                    on_line(&line);
-                }
+                Ok(line) => writeln!(log, "{line}").with_context(logging)?,
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }

@@ -1,14 +1,10 @@
 //! `clift doctor`: the machine and its devices.
 
-use std::path::PathBuf;
-
-use clift_bench::{DeviceCheck, Gradient, probe};
+use clift_bench::{DeviceCheck, probe};
 use clift_eval::{machine_rows, table};
 use clift_model::{DeviceName, InstructionSet, Precision, product_instructions};
 
-use crate::commands::args::parse::parse_output;
 use crate::commands::doctor::{adapters, stability};
-use crate::output::output_file::OutputFile;
 use crate::output::stdout::print_result;
 
 /// Largest accepted difference of a gradient over its largest entry: orders of sums differ by 1e-6, wrong kernels by 1.
@@ -22,8 +18,7 @@ const TOLERANCE_BF16: f64 = 2e-1;
 /// Prints the machine and a row per device, or runs the stability cases; fails with the default device or a case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
-        let markdown = args.markdown.as_ref().map(|path| OutputFile::new(path, args.force, &[])).transpose()?;
-        return stability::run(markdown.as_ref());
+        return stability::run();
     }
     let machine = [("clift", version())].into_iter().chain(machine_rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
@@ -78,32 +73,23 @@ fn version() -> String {
     format!("{}, cargo features: {features}, {os} {arch}", env!("CARGO_PKG_VERSION"))
 }
 
-/// Describes the instruction set of the flex kernels, the reason for it, and the alternatives.
+/// Describes the instruction set of the flex kernels, and the narrower ones of this processor.
 fn kernels() -> String {
-    let variable = InstructionSet::VARIABLE;
-    match InstructionSet::forced() {
-        Err(bad) => format!("{variable} = {}: {bad}", bad.text),
-        Ok(forced) => {
-            let used = InstructionSet::detected();
-            let why = if forced.is_some() { format!("set by {variable}") } else { "widest".into() };
-            let others = InstructionSet::available().filter(|set| *set != used).map(InstructionSet::name);
-            let others = Some(others.collect::<Vec<_>>().join(", ")).filter(|names| !names.is_empty());
-            let others = others.unwrap_or_else(|| "none".into());
-            format!("{} ({why}; also available: {others})", used.name())
-        }
-    }
+    let used = InstructionSet::detected();
+    let others = InstructionSet::available().filter(|set| *set != used).map(InstructionSet::name);
+    let others = Some(others.collect::<Vec<_>>().join(", ")).filter(|names| !names.is_empty());
+    format!("{} (widest; also available: {})", used.name(), others.unwrap_or_else(|| "none".into()))
 }
 
 /// Refuses a gradient that is zero, not finite or different from the reference.
 fn check(probe: DeviceCheck, reference: Option<&DeviceCheck>, tolerance: f64) -> Result<DeviceCheck, String> {
-    let Gradient { values, .. } = &probe.gradient;
-    if let Some(value) = values.iter().find(|value| !value.is_finite()) {
+    if let Some(value) = probe.gradient.iter().find(|value| !value.is_finite()) {
         return Err(format!("the gradient contains {value}"));
     }
-    if values.iter().all(|value| *value == 0.0) {
+    if probe.gradient.iter().all(|value| *value == 0.0) {
         return Err("the gradient is zero".into());
     }
-    match reference.map(|reference| probe.gradient.difference(&reference.gradient)) {
+    match reference.map(|reference| probe.difference(reference)) {
         Some(difference) if difference.is_nan() || difference > tolerance => {
             Err(format!("the gradient differs by {difference:.1e}, at most {tolerance:.0e} is accepted"))
         }
@@ -131,14 +117,14 @@ fn row(
             let failure = format!("{device}: {reason}");
             ([device, "FAILED".into(), dash(), dash(), dash(), dash()], Some(failure))
         }
-        Ok(DeviceCheck { adapter, dtypes, gradient, seconds }) => {
+        Ok(check) => {
             let difference = match reference {
                 _ if is_default => "reference".into(),
-                Some(reference) => format!("{:.1e}", gradient.difference(&reference.gradient)),
+                Some(reference) => format!("{:.1e}", check.difference(reference)),
                 None => dash(),
             };
-            let time = format!("{:.1} ms", seconds * 1e3);
-            ([device, "ok".into(), adapter.clone(), dtypes.join(" "), time, difference], None)
+            let time = format!("{:.1} ms", check.seconds * 1e3);
+            ([device, "ok".into(), check.adapter.clone(), check.dtypes.join(" "), time, difference], None)
         }
     }
 }
@@ -155,21 +141,14 @@ pub struct DoctorArgs {
     /// Run the stability cases instead: hard numerical inputs against f64
     #[arg(long)]
     pub stability: bool,
-    /// Write the table of the cases as Markdown
-    #[arg(long, requires = "stability", value_name = "FILE", value_parser = parse_output)]
-    pub markdown: Option<PathBuf>,
-    /// Replace an existing file
-    #[arg(long, requires = "markdown")]
-    pub force: bool,
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn check_of(values: Vec<f64>) -> DeviceCheck {
-        let gradient = Gradient { loss: 1.0, values };
-        DeviceCheck { adapter: "CPU".into(), dtypes: vec!["f32"], gradient, seconds: 0.0125 }
+    fn check_of(gradient: Vec<f64>) -> DeviceCheck {
+        DeviceCheck { adapter: "CPU".into(), dtypes: vec!["f32"], loss: 1.0, gradient, seconds: 0.0125 }
     }
 
     #[test]
@@ -200,15 +179,5 @@ ndarray         FAILED  -        -       -        -
 flex, f16       ok      CPU      f32     12.5 ms  0.0e0
 ndarray: panicked: a very long reason";
         assert_eq!(device_table(rows), expected);
-    }
-
-    #[test]
-    fn f16_is_near_f32_or_refused() {
-        let reference = probe(DeviceName::Flex, Precision::F32).unwrap();
-        let f16 = probe(DeviceName::Flex, Precision::F16).unwrap();
-        let difference = f16.gradient.difference(&reference.gradient);
-        assert!(difference > 1e-6 && difference < TOLERANCE_F16, "{difference:e}");
-        let message = probe(DeviceName::Ndarray, Precision::F16).unwrap_err();
-        assert!(message.contains("has no f16"), "{message}");
     }
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use crate::error::DataError;
 use crate::files::listing::decode_name;
-use crate::geometry::lens_models::MODELS;
+use crate::geometry::lens::MODELS;
 use crate::sources::photos::colmap::model::{Cameras, ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera};
 
 /// Bytes of an image point: two coordinates and the id of the 3D point.

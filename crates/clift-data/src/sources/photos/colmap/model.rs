@@ -6,8 +6,7 @@ use clift_core::{Intrinsics, IntrinsicsNorm, Pose};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::error::DataError;
-use crate::geometry::lens::Lens;
-use crate::geometry::lens_models::MODELS;
+use crate::geometry::lens::{Lens, MODELS};
 use crate::sources::photos::photo::MAX_FRAMES;
 
 /// Largest number of cameras of a model: one per image.

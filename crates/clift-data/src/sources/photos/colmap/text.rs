@@ -47,8 +47,8 @@ fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
             (name.unwrap_or_else(|| format!("line {}", lines.number)), format!("whose line is malformed: {what}"))
         });
         read.add_image(image).map_err(|what| lines.bad(&what))?;
-        // The line of points may be empty, but an image line in its place is an error.
-        if lines.next_line()? && lines.is_of_image() {
+        // The line of points may be empty, but an image line in its place is an error: its numbers form a unit quaternion.
+        if lines.next_line()? && parse_image(&decode_name(&lines.line)).is_ok_and(|image| image.c2w().is_ok()) {
             return Err(
                 lines.bad("expected the points of the image above: two lines per image, the second may be empty")
             );
@@ -140,10 +140,5 @@ impl<'a> Lines<'a> {
             return Ok(Some(decode_name(line)));
         }
         Ok(None)
-    }
-
-    /// Returns whether this is the line of an image: the numbers of points do not form a unit quaternion.
-    fn is_of_image(&self) -> bool {
-        parse_image(&decode_name(&self.line)).is_ok_and(|image| image.c2w().is_ok())
     }
 }

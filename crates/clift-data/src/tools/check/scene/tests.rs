@@ -2,75 +2,47 @@
 
 use std::sync::OnceLock;
 
-use clift_core::{Camera, IntrinsicsNorm, Pose};
+use clift_core::{Camera, IntrinsicsNorm, Pose, RgbImage};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::*;
 use crate::error::DataError;
-use crate::testing;
-use crate::tools::check::result::{MAX_EPIPOLAR_PX, Verdict};
+use crate::testing::{self, TestSource};
+use crate::tools::check::result::Verdict;
 
-struct RenderedRoom {
-    cameras: Vec<Camera<IntrinsicsNorm>>,
-    frames: Vec<RgbImage>,
-}
-
-/// Returns two rooms with fine patterns, seen from nearby as in a video.
-fn rooms() -> &'static [RenderedRoom] {
-    static ROOMS: OnceLock<Vec<RenderedRoom>> = OnceLock::new();
-    ROOMS.get_or_init(|| {
+/// A room with fine patterns, seen from nearby as in a video.
+fn room() -> &'static (Vec<Camera<IntrinsicsNorm>>, Vec<RgbImage>) {
+    static ROOM: OnceLock<(Vec<Camera<IntrinsicsNorm>>, Vec<RgbImage>)> = OnceLock::new();
+    ROOM.get_or_init(|| {
         let source = testing::rooms(|c| {
             (c.num_frames, c.width, c.height) = (12, 320, 240);
             (c.path_length, c.texture_frequency, c.specular) = (1.2, 3.0, 0.1);
         });
-        let rendered = |scene: usize| RenderedRoom {
-            cameras: source.cameras(scene).unwrap(),
-            frames: (0..12).into_par_iter().map(|frame| source.frame(scene, frame).unwrap()).collect(),
-        };
-        (0..2).map(rendered).collect()
+        let frames = (0..12).into_par_iter().map(|frame| source.frame(0, frame).unwrap()).collect();
+        (source.cameras(0).unwrap(), frames)
     })
 }
 
-struct Changed<C, F> {
-    room: &'static RenderedRoom,
-    cameras: C,
-    frame: F,
-}
-
-impl<C, F> SceneSource for Changed<C, F>
-where
-    C: Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync,
-    F: Fn(usize) -> usize + Send + Sync,
-{
-    fn num_scenes(&self) -> usize {
-        1
-    }
-
-    fn key(&self, _scene: usize) -> &'static str {
-        "room"
-    }
-
-    fn find(&self, _key: &str) -> Option<usize> {
-        None
-    }
-
-    fn cameras(&self, _scene: usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
-        let mut cameras = self.room.cameras.clone();
-        cameras.iter_mut().enumerate().for_each(|(frame, camera)| (self.cameras)(frame, camera));
+/// Checks the room with other cameras and frames.
+fn check_changed(
+    change: impl Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync + 'static,
+    shown: impl Fn(usize) -> Option<usize> + Send + Sync + 'static,
+) -> SceneCheck {
+    let source = TestSource::new(testing::rooms(|_| ())).with_cameras(move |_, _| {
+        let mut cameras = room().0.clone();
+        cameras.iter_mut().enumerate().for_each(|(frame, camera)| change(frame, camera));
         Ok(cameras)
-    }
-
-    fn frame(&self, _scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        match (self.frame)(frame) {
-            usize::MAX => Err(DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() }),
-            shown => Ok(self.room.frames[shown].clone()),
-        }
-    }
+    });
+    let source = source.with_frames(move |_, _, frame| {
+        let torn = || DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() };
+        shown(frame).map(|shown| room().1[shown].clone()).ok_or_else(torn)
+    });
+    check_scene(&source, 0)
 }
 
-fn check(cameras: impl Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync) -> SceneCheck {
-    check_scene(&Changed { room: &rooms()[0], cameras, frame: |frame| frame }, 0).check
+fn check(change: impl Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync + 'static) -> SceneCheck {
+    check_changed(change, Some)
 }
 
 /// Turns a camera up or down. The path leads sideways, so a sideways turn moves points along their epipolar lines.
@@ -79,34 +51,20 @@ fn turned(c2w: Pose, angle_deg: f64) -> Pose {
 }
 
 #[test]
-fn rooms_with_correct_cameras_pass() {
-    for room in rooms() {
-        let source = Changed { room, cameras: |_, _: &mut _| (), frame: |frame| frame };
-        let CheckedScene { check, image } = check_scene(&source, 0);
-        assert!(check.verdict == Verdict::Ok && check.reasons.is_empty(), "{check:?}");
-        assert_eq!((check.num_frames, check.image_size), (12, Some([320, 240])));
-        assert!(check.epipolar_px.is_some_and(|px| px < 0.7), "{check:?}");
-        assert!(check.pairs.len() >= 5, "{check:?}");
-        assert_eq!(image.unwrap().height, 240);
-    }
-}
-
-#[test]
-fn cameras_that_contradict_the_images_fail() {
-    let flagged = |name: &str, check: SceneCheck| {
-        assert_eq!(check.verdict, Verdict::Flagged, "{name}: {check:?}");
-        assert!(check.epipolar_px.is_some_and(|px| px > MAX_EPIPOLAR_PX), "{name}: {check:?}");
-        assert!(check.reasons[0].contains("from their epipolar lines"), "{name}: {check:?}");
+fn cameras_that_contradict_the_images_are_flagged() {
+    let right = check(|_, _| ());
+    assert!(right.verdict == Verdict::Ok && right.reasons.is_empty(), "{right:?}");
+    assert_eq!((right.num_frames, right.image_size), (12, Some([320, 240])));
+    assert!(right.epipolar_px.is_some_and(|px| px < 0.7) && right.pairs.len() >= 5, "{right:?}");
+    let flagged = |check: SceneCheck| {
+        assert!(check.verdict == Verdict::Flagged && check.epipolar_px.is_some_and(|px| px > 1.0), "{check:?}");
+        assert!(check.reasons[0].contains("from their epipolar lines"), "{check:?}");
     };
     // A degree of a focal length of 417 pixels, at 640 columns, is 7 pixels.
     let angle_deg = |frame: usize| 0.8 * ((frame * 7919 % 13) as f64 / 6.0 - 1.0);
-    flagged("random turns", check(|frame, camera| camera.c2w = turned(camera.c2w, angle_deg(frame))));
-    let opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-    flagged("OpenGL axes", check(|_, camera| camera.c2w.rotation *= opengl));
-    flagged("world to camera", check(|_, camera| camera.c2w = camera.c2w.inverse()));
-    flagged("focal length of another camera", check(|_, camera| camera.intrinsics.fx *= 1.25));
-    let shuffled = Changed { room: &rooms()[0], cameras: |_, _: &mut _| (), frame: |frame| (frame * 5 + 2) % 12 };
-    flagged("frames of other cameras", check_scene(&shuffled, 0).check);
+    flagged(check(move |frame, camera| camera.c2w = turned(camera.c2w, angle_deg(frame))));
+    flagged(check(|_, camera| camera.intrinsics.fx *= 1.25));
+    flagged(check_changed(|_, _| (), |frame| Some((frame * 5 + 2) % 12)));
 }
 
 #[test]
@@ -117,9 +75,9 @@ fn usual_mistakes_are_named() {
         assert!(check.frames.is_empty());
     };
     let opposite = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-    named(check(|_, camera| camera.c2w.rotation *= opposite), "the y and z axes of every camera reversed");
+    named(check(move |_, camera| camera.c2w.rotation *= opposite), "the y and z axes of every camera reversed");
     named(check(|_, camera| camera.c2w = camera.c2w.inverse()), "every pose inverted (");
-    let view_matrix = |_: usize, camera: &mut Camera<IntrinsicsNorm>| {
+    let view_matrix = move |_: usize, camera: &mut Camera<IntrinsicsNorm>| {
         camera.c2w.rotation *= opposite;
         camera.c2w = camera.c2w.inverse();
     };
@@ -139,7 +97,7 @@ fn usual_mistakes_are_named() {
 
 #[test]
 fn exchanged_neighbours_and_single_cameras_are_named() {
-    let original = &rooms()[0].cameras;
+    let original = &room().0;
     for first in [2, 4, 9] {
         let exchanged = check(move |frame, camera| {
             if frame == first || frame == first + 1 {
@@ -188,25 +146,17 @@ fn implausible_cameras_fail_with_the_reason() {
 
 #[test]
 fn repeated_and_unreadable_frames_are_reported() {
-    let source = testing::rooms(|c| (c.num_frames, c.width, c.height) = (8, 48, 32));
-    let frames = (0..8).map(|frame| source.frame(0, frame).unwrap()).collect();
-    let room: &'static RenderedRoom = Box::leak(Box::new(RenderedRoom { cameras: source.cameras(0).unwrap(), frames }));
-    let of = |frame: fn(usize) -> usize, cameras: fn(usize, &mut Camera<IntrinsicsNorm>)| {
-        check_scene(&Changed { room, cameras, frame }, 0).check
-    };
-    let stuck = of(|frame| frame.min(5), |_, _| ());
-    assert_eq!(stuck.verdict, Verdict::Flagged);
-    assert_eq!(stuck.reasons, ["2 frames (6, 7) repeat the image of an earlier frame that has another camera"]);
-    let torn = of(|frame| if frame == 2 { usize::MAX } else { frame }, |_, _| ());
+    let stuck = check_changed(|_, _| (), |frame| Some(frame.min(9)));
+    let repeated = "2 frames (10, 11) repeat the image of an earlier frame that has another camera";
+    assert!(stuck.verdict == Verdict::Flagged && stuck.reasons.contains(&repeated.to_owned()), "{stuck:?}");
+    let torn = check_changed(|_, _| (), |frame| (frame != 2).then_some(frame));
     let expected = "1 frame (2) cannot be read; the first: frame 2 of scene k cannot";
     assert!(torn.reasons[0].starts_with(expected), "{torn:?}");
     // Images too small for corners add a note, no error.
-    let small = of(|frame| frame, |_, _| ());
+    let small = check_scene(&testing::rooms(|c| (c.num_frames, c.width, c.height) = (8, 48, 32)), 0);
     assert!(small.verdict == Verdict::NotCompared && small.epipolar_px.is_none(), "{small:?}");
-    assert!(
-        small.notes[0].starts_with("poses were not compared with the images: only 0 matching corners"),
-        "{small:?}"
-    );
+    let expected = "poses were not compared with the images: only 0 matching corners";
+    assert!(small.notes[0].starts_with(expected), "{small:?}");
 }
 
 #[test]

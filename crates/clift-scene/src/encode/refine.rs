@@ -1,0 +1,169 @@
+//! Fits the tokens of a capture to its photos, by gradient descent through the renderer. No weight changes.
+//!
+//! A group of neighbours is fitted to the photos of its own views, and to photos of other groups near it, as frames between
+//! the photos are rendered: these hold the geometry that its own photos leave open.
+// S stored tokens of a group, D width
+
+use burn::module::Module;
+use burn::tensor::{Tensor, TensorData};
+use clift_core::{ClipViews, Pose, ViewDistance, derive_seed, step_rng, uniform_below};
+use clift_model::{Cameras, ModelError, Renderer, Tokens, TrainedModel, Views};
+
+use crate::error::SceneError;
+use crate::scene::scene::{ContextGroup, Scene};
+use crate::scene::scene_renderer::group_shares;
+
+const PHOTOS_PER_STEP: usize = 3;
+/// Weight of a photo of the group's own views; those of other photos are their shares of the group.
+const OWN_WEIGHT: f64 = 0.25;
+/// Size of the first step as a share of the root mean square of the tokens; falls to 0. A larger one fits noise.
+const RATE: f64 = 0.01;
+
+/// Fits the tokens of a scene of several groups in `steps` steps per group. `context` are images and cameras of all context
+/// views. `progress` gets the numbers of fitted and of all groups.
+pub(crate) fn refine(
+    model: &TrainedModel,
+    context: &ClipViews,
+    scene: &mut Scene,
+    (steps, seed): (usize, u64),
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<(), SceneError> {
+    let renderer = model.network.renderer.clone().train().no_grad();
+    let photos = photos_of_groups(scene);
+    let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
+    let mut first_patch = 0;
+    for (i, positions) in scene.tokens_of_groups().iter().enumerate() {
+        let group = &scene.groups[i];
+        let seed = derive_seed(seed, &format!("refine group {i}"));
+        let mut fit = GroupFit::new(model, scene, group, positions, first_patch)?;
+        for step in 0..steps {
+            let chosen = choose(&photos[i], seed, step);
+            let target = ContextGroup { views: chosen, frame: group.frame }.members(context);
+            fit.step(&renderer, &target, model, step as f64 / steps as f64)?;
+        }
+        first_patch += (group.views.len() * patches_per_view) as u32;
+        let (dim, values) = (scene.model.dim, fit.tokens.to_host()?);
+        for (&token, row) in positions.iter().zip(values.chunks_exact(dim)) {
+            scene.tokens[token as usize * dim..][..dim].copy_from_slice(row);
+        }
+        progress(i + 1, photos.len());
+    }
+    Ok(())
+}
+
+/// Returns the photos that every group is fitted to, with their weights: its own views, and views of other groups of which it
+/// has a share when they are rendered without the groups that they belong to.
+fn photos_of_groups(scene: &Scene) -> Vec<Vec<(u32, f64)>> {
+    let poses: Vec<Pose> = scene.context.iter().map(|camera| camera.c2w).collect();
+    let distance = ViewDistance::new(&poses);
+    let mut photos: Vec<Vec<(u32, f64)>> =
+        scene.groups.iter().map(|group| group.views.iter().map(|&view| (view, OWN_WEIGHT)).collect()).collect();
+    for (view, pose) in poses.iter().enumerate() {
+        let others: Vec<usize> =
+            (0..photos.len()).filter(|&group| !scene.groups[group].views.contains(&(view as u32))).collect();
+        let to_group = |&group: &usize| {
+            distance.to_group(pose, scene.groups[group].views.iter().map(|&member| &poses[member as usize]))
+        };
+        for (i, share) in group_shares(&others.iter().map(to_group).collect::<Vec<_>>()) {
+            photos[others[i]].push((view as u32, share));
+        }
+    }
+    photos
+}
+
+/// Draws the photos of a step with replacement, in proportion to their weights.
+fn choose(photos: &[(u32, f64)], seed: u64, step: usize) -> Vec<u32> {
+    const LEVELS: usize = 1 << 20;
+    let sum: f64 = photos.iter().map(|(_, weight)| weight).sum();
+    let mut rng = step_rng(seed, step as u64, "photos");
+    let mut draw = || {
+        let mut left = uniform_below(&mut rng, LEVELS) as f64 / LEVELS as f64 * sum;
+        let passed = |(_, weight): &&(u32, f64)| {
+            left -= weight;
+            left >= 0.0
+        };
+        let position = photos.iter().take_while(passed).count();
+        photos[position.min(photos.len() - 1)].0
+    };
+    (0..PHOTOS_PER_STEP).map(|_| draw()).collect()
+}
+
+/// The tokens of a group and the moments of Adam.
+struct GroupFit {
+    /// With the transforms of their patches, `[1, S, D]`.
+    tokens: Tokens,
+    mean: Tensor<3>,
+    square: Tensor<3>,
+    scale: f64,
+    num_steps: i32,
+}
+
+impl GroupFit {
+    fn new(
+        model: &TrainedModel,
+        scene: &Scene,
+        group: &ContextGroup,
+        positions: &[u32],
+        first_patch: u32,
+    ) -> Result<Self, ModelError> {
+        let (dim, device) = (scene.model.dim, &model.device);
+        let rows = positions.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
+        let rows: Vec<f32> = rows.copied().collect();
+        let scale = (rows.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>() / rows.len() as f64).sqrt();
+        let values = Tensor::from_data(TensorData::new(rows, [1, positions.len(), dim]), device);
+        let patches: Vec<u32> = positions.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
+        let cameras = Cameras::of_views(&scene.group_cameras(group), scene.height, scene.width, device)?;
+        let (mean, square) = (Tensor::zeros_like(&values), Tensor::zeros_like(&values));
+        let tokens = Tokens::of_patches(&scene.model, values, &cameras, &patches);
+        Ok(Self { tokens, mean, square, scale, num_steps: 0 })
+    }
+
+    /// Makes a step of Adam for the mean squared error of `target`; `passed` is the part of all steps before it.
+    fn step(
+        &mut self,
+        renderer: &Renderer,
+        target: &ClipViews,
+        model: &TrainedModel,
+        passed: f64,
+    ) -> Result<(), ModelError> {
+        const DECAY: [f64; 2] = [0.9, 0.99];
+        let views = Views::upload(&[target], &model.device.clone().autodiff())?;
+        let values = self.tokens.values.clone().autodiff().require_grad();
+        let image = renderer.forward(self.tokens.with_values(values.clone()), &views.cameras);
+        let gradients = (image - views.images).powi_scalar(2).mean().backward();
+        let gradient = values.grad(&gradients).expect("the image depends on the tokens");
+        self.num_steps += 1;
+        self.mean = self.mean.clone() * DECAY[0] + gradient.clone() * (1.0 - DECAY[0]);
+        self.square = self.square.clone() * DECAY[1] + gradient.powi_scalar(2) * (1.0 - DECAY[1]);
+        let [first, second] = DECAY.map(|decay| 1.0 - decay.powi(self.num_steps));
+        let step = self.mean.clone() / first / ((self.square.clone() / second).sqrt() + 1e-12);
+        let values = self.tokens.values.clone() - step * (RATE * self.scale * (1.0 - passed));
+        self.tokens = self.tokens.with_values(values);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::scene::tests::scene_of_groups;
+
+    #[test]
+    fn groups_are_fitted_to_their_own_photos_and_to_those_near_them() {
+        let scene = scene_of_groups();
+        let photos = photos_of_groups(&scene);
+        for (group, photos) in scene.groups.iter().zip(&photos) {
+            let own = photos.iter().filter(|(_, weight)| *weight == OWN_WEIGHT).map(|(view, _)| *view);
+            assert_eq!(own.take(group.views.len()).collect::<Vec<_>>(), group.views);
+            assert!(photos[group.views.len()..].iter().all(|(view, _)| !group.views.contains(view)), "{photos:?}");
+        }
+    }
+
+    #[test]
+    fn photos_are_drawn_in_proportion_to_their_weights() {
+        let photos = [(7, 0.5), (3, 1.5), (5, 0.0)];
+        let drawn: Vec<u32> = (0..2000).flat_map(|step| choose(&photos, 1, step)).collect();
+        let share = |photo| drawn.iter().filter(|&&drawn| drawn == photo).count() as f64 / drawn.len() as f64;
+        assert!((share(7) - 0.25).abs() < 0.02 && (share(3) - 0.75).abs() < 0.02 && share(5) == 0.0);
+    }
+}
