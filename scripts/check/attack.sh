@@ -2,8 +2,8 @@
 # Attacks every reader with damaged files, by default ten minutes each:
 #   bash scripts/check/attack.sh [SECONDS] [more arguments of clift-attack: --seed 3, --target pickle]
 #
-# What is found lies in findings/ afterwards, and the command that shows it again is
-#   clift-attack --target NAME --seed SEED --first NUMBER
+# What is found lies in findings/ afterwards; this attacks again from that input on:
+#   clift-attack --target NAME --seed SEED --first NUMBER --seconds 1
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 seconds=${1:-600}

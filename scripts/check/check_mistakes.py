@@ -214,7 +214,8 @@ def main():
         for number, folder in enumerate(args.folders):
             (root / f"good/{number}").mkdir(parents=True)
             for path in folder.glob("**/*.torch"):
-                for scene in torch.load(path, weights_only=True):
+                loaded = torch.load(path, weights_only=True)
+                for scene in [loaded] if isinstance(loaded, dict) else loaded:
                     torch.save(scene, root / f"good/{number}" / f"{scene['key']}.torch")
         good = checked(args.clift, root / "good")
         for row in good.values():

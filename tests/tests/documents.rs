@@ -12,16 +12,10 @@ use crate::evaluation::eval::write_vgg;
 use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, start};
 use crate::viewer::tab::Viewer;
 
-/// The key of the test scene of `re10k-mini`, for the keys of the documents.
-const KEY: &str = "00000000000000b1";
-
 /// Words of the documents, and those for small data.
-const SMALLER: [(&str, &str); 7] = [
-    // Later examples read the other data.
-    (" /data/re10k-txt /data/re10k ", " /data/re10k-txt /data/converted "),
+const SMALLER: [(&str, &str); 5] = [
     (" /data/", " data/"),
     ("--scene KEY", "--scene 00000000000000b1"),
-    ("chunks|scenes", "chunks"),
     ("--distance 45..135", "--distance 6..7"),
     ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
     ("--stored-tokens 256", "--stored-tokens 2"),
@@ -168,7 +162,6 @@ fn make_room(folder: &Path, args: &[String]) {
     let flags = args.windows(2).filter(|pair| is_output(&pair[0])).map(|pair| &pair[1]);
     let positional = match [args[0].as_str(), args.get(1).map_or("", String::as_str)] {
         ["data", "synth"] => args.get(2),
-        ["data", "convert"] => args.get(3),
         _ => None,
     };
     for path in flags.chain(positional) {
@@ -248,15 +241,12 @@ fn prepare(base: &Path) {
         copy(&fixture("layouts/colmap_txt/attic"), name);
     }
     copy(&fixture("layouts/colmap_bin/attic/images"), "photos");
-    copy(&fixture("layouts/re10k_txt"), "data/re10k-txt");
-    copy(&fixture("layouts/dl3dv"), "data/dl3dv");
     copy(&fixture("layouts/dl3dv"), "DL3DV-ALL-480P");
     // A scene to train on beside that of the list of test scenes.
     let scene =
         std::fs::read_dir(fixture("layouts/dl3dv/1K")).expect("a folder").next().expect("a scene").expect("readable");
     let test_key = "f".repeat(64);
     copy(&scene.path(), &format!("DL3DV-ALL-480P/1K/{test_key}"));
-    std::fs::write(base.join("benchmark.txt"), "").expect("writable");
 
     let index = fixture("re10k-mini/evaluation_index.json");
     for name in ["evaluation_index_re10k_context4", "evaluation_index_re10k_video_context4_data_100", "INDEX"] {
@@ -269,9 +259,6 @@ fn prepare(base: &Path) {
     std::fs::write(base.join("dl3dv_start_0_distance_50_ctx_4v_video_0_50.json"), dl3dv.to_string()).expect("writable");
     let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
     std::fs::write(base.join("poses.json"), json!({"poses": [pose]}).to_string()).expect("writable");
-    let image = base.join("out/mvsplat").join(KEY).join("000001.png");
-    std::fs::create_dir_all(image.parent().expect("a folder")).expect("writable");
-    image::RgbImage::new(16, 16).save(image).expect("writable");
     write_vgg(&base.join("lpips-vgg.safetensors"), "clift-lpips-vgg-1", [2, 2, 3, 3, 3], true);
 
     for name in ["second_stage.ckpt", "last.ckpt"] {
@@ -309,7 +296,7 @@ fn prepare(base: &Path) {
     for name in ["runs/capture", "runs/attic"] {
         copy(&base.join("runs/rooms"), name);
     }
-    clift(&["export", "runs/rooms", "--format", "f16", "-o", "models/rooms"]);
+    clift(&["export", "runs/rooms", "-o", "models/rooms"]);
     let tiny = ["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"];
     clift(&tiny);
 }

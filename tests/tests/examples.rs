@@ -1,9 +1,10 @@
 //! Every example of the crates runs.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::support::{BINARY, Place, finish, repository, start};
+use crate::support::{BINARY, Place, finish, repository, sources, start};
 
 /// The examples with their arguments and a part of their output. `REPO` is the repository, `DIR` a temporary folder with the
 /// photos of a scene. An example may read what one before it wrote.
@@ -17,6 +18,12 @@ const WRITTEN: [&str; 4] = ["fitted.png", "sheet.png", "scene.clift", "scene.png
 
 #[test]
 fn every_example_runs() {
+    let found = sources(&["crates"], &["rs"]).into_keys().filter_map(|path| {
+        let (_, name) = path.split_once("/examples/")?;
+        (!name.contains('/')).then(|| name.trim_end_matches(".rs").to_owned())
+    });
+    let listed = EXAMPLES.map(|(name, ..)| name.to_owned());
+    assert_eq!(found.collect::<BTreeSet<_>>(), listed.into(), "EXAMPLES lists every example");
     let built = Path::new(BINARY).parent().expect("a folder").join("examples");
     let place = Place::new();
     place.clift("data synth DIR/photos --look real --scenes 1 --frames 16 --size 128x128").ok();

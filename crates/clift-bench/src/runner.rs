@@ -113,6 +113,7 @@ fn measure(
     }
     let peak_bytes = if has_peak { peak_bytes() } else { None };
     let max_rel_error = options.error.then(|| task.error(&context.reference()?)).transpose()?;
+    go_on()?;
     let (median_s, p95_s) = (median(&samples_s), p95(&samples_s));
     Ok(BenchRow { case, median_s, p95_s, peak_bytes, max_rel_error, samples_s })
 }

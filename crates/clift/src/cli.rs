@@ -152,9 +152,6 @@ Examples:
     /// model.safetensors, config.toml (network sizes and evaluation protocol) and import.json (origin of each parameter).
     Import(ImportArgs),
     /// Write a model directory with the weights in f16
-    #[command(after_help = "\
-Examples:
-  clift export runs/rooms --format f16 -o models/my-rooms")]
     Export(ExportArgs),
 }
 

@@ -69,8 +69,8 @@ fn latents_are_stored_and_rendered_whole() {
     let encoded = place.clift(&format!("{encode} --format f32")).ok().prints("5 of 5 tokens (latents, f32)");
     assert!(!encoded.stdout.contains("clusters"), "{}", encoded.stdout);
     place.clift("render DIR/room.clift --path interpolate --frames 3 -o DIR/frames").ok().prints("5 of 5 tokens");
-    place.clift("export DIR/run --format f16 -o DIR/half").ok();
-    place.clift("export DIR/run --format f16 -o DIR/half").fails_with(2, &["the path exists"]);
+    place.clift("export DIR/run -o DIR/half").ok();
+    place.clift("export DIR/run -o DIR/half").fails_with(2, &["the path exists"]);
     place.clift("plan DIR/run/config.toml").ok().prints("stage1");
 
     place

@@ -249,7 +249,7 @@ fn encode_compares_a_frame_that_is_no_context() {
     encode("--context 4,6")
         .prints("check: frame 5, not a context: ")
         .notes(&format!("{warning}5 is worse than a copy"));
-    let ran = encode("--context 0,1,2,3,4,5,6,7").prints("check: the context views are rendered at ");
+    let ran = encode("--context 0,1,2,3,4,5,6,7").prints("check: 8 context views rendered at ");
     assert!(!ran.stdout.contains("not a context"), "{}", ran.stdout);
 }
 

@@ -17,7 +17,7 @@ fn a_run_writes_every_documented_file() {
     for line in ["steps = 6", "dim = 16", "max_grad_norm = 1.0", "pose_scale = \"context\""] {
         assert!(config.contains(line), "{line}: {config}");
     }
-    assert_eq!(place.json("run/run.json"), serde_json::json!({"version": 2}));
+    assert_eq!(place.json("run/run.json"), serde_json::json!({"version": 3}));
 
     let lines = place.metrics("run");
     let steps = lines.iter().map(|line| (line["stage"].as_str().unwrap(), line["step"].as_u64().unwrap()));

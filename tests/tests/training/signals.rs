@@ -1,9 +1,10 @@
 //! Signals and second processes.
 
 use std::os::unix::process::ExitStatusExt;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::support::{Place, finish, signal, wait_until};
+use crate::support::{BINARY, Place, finish, signal, skip, start, wait_until};
 
 /// A run that lasts until the signal arrives.
 const LONG: [&str; 5] =
@@ -24,6 +25,7 @@ fn signals_save_and_runs_resume_to_the_same_result() {
     place.train("whole", &set).ok();
     for (name, code, count) in [("-INT", 130, 10), ("-HUP", 129, 60), ("-TERM", 143, 130)] {
         if name == "-HUP" && is_hang_up_ignored() {
+            skip("sighup", "the tests run under nohup");
             continue;
         }
         let mut child = place.start_train("run", &set);
@@ -112,4 +114,18 @@ fn second_processes_are_refused_while_the_first_lives() {
     place.wait_for_steps("run", &mut next, 5);
     signal(&next, "-INT");
     finish(next).fails(130);
+}
+
+#[test]
+fn a_run_started_by_nohup_outlives_its_terminal() {
+    let place = Place::new();
+    let mut command = Command::new("sh");
+    command.args(["-c", "trap '' HUP; exec \"$@\"", "sh", BINARY]).args(place.train_args("run", &LONG));
+    let mut child = start(&mut command);
+    place.wait_for_steps("run", &mut child, 5);
+    signal(&child, "-HUP");
+    let steps = place.metrics("run").len();
+    place.wait_for_steps("run", &mut child, steps + 20);
+    signal(&child, "-TERM");
+    finish(child).fails_with(143, &[]);
 }

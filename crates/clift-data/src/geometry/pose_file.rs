@@ -15,6 +15,7 @@ const MAX_POSES: usize = 100_000;
 const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
 
 #[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct PoseFile {
     poses: Vec<FilePose>,
 }
@@ -138,7 +139,7 @@ mod tests {
                 r#"{"poses": [{"c2w": [[1,0,0,506],[0,1,0,0],[0,0,1,0]]}]}"#,
                 "pose 0: bad camera: the camera is 1010 times the contexts' extent away",
             ),
-            (r#"{"pose": []}"#, "missing field `poses`"),
+            (r#"{"pose": []}"#, "unknown field `pose`"),
         ] {
             let message = read(json).unwrap_err().to_string();
             assert!(message.contains(part) && message.ends_with("poses.json"), "{message}");

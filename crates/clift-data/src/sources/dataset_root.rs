@@ -16,8 +16,8 @@ use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder, find_scenes,
 pub struct DatasetRoot {
     /// Path of the root.
     pub path: PathBuf,
-    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`: not if one of these is a capture,
-    /// such as `train` of Tanks and Temples.
+    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`: not if only one of these is a
+    /// capture, such as `train` of Tanks and Temples.
     pub has_splits: bool,
 }
 
@@ -27,8 +27,9 @@ impl DatasetRoot {
         std::fs::metadata(path).map_err(DataError::io("opening the data", path))?;
         let mut splits = [Split::Train, Split::Test].map(|split| path.join(split.to_string())).to_vec();
         splits.retain(|split| split.is_dir());
-        let is_capture = scene_in(path).is_some() || splits.iter().any(|split| scene_in(split).is_some());
-        Ok(Self { path: path.to_owned(), has_splits: !splits.is_empty() && !is_capture })
+        let num_captures = splits.iter().filter(|split| scene_in(split).is_some()).count();
+        let is_split = scene_in(path).is_none() && (num_captures == 0 || num_captures == 2);
+        Ok(Self { path: path.to_owned(), has_splits: !splits.is_empty() && is_split })
     }
 }
 

@@ -44,7 +44,7 @@ impl StateDict {
         let num_bytes = std::fs::metadata(path).map_err(DataError::io("opening the checkpoint", path))?.len();
         let archive = Archive::open(path).map_err(as_checkpoint)?;
         let bytes = archive.read_pickle(path).map_err(as_checkpoint)?;
-        let pickle = Pickle::parse_checkpoint(&bytes, path)?;
+        let pickle = Pickle::parse(&bytes, path)?;
         let root = pickle.root();
         let state = pickle.item(root, "state_dict").unwrap_or(root);
         let Value::Dict(items) = state else {

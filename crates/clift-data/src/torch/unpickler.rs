@@ -4,10 +4,8 @@ use std::collections::{BTreeSet, HashMap};
 
 use crate::torch::values::{ElementType, Global, MAX_BYTES, MAX_VALUES, Storage, Tensor, Value, ValueId};
 
-/// Deepest nesting of unfinished lists, dicts and tuples in chunks, which need five levels.
-const MAX_DEPTH: usize = 32;
-/// Deepest nesting in checkpoints, which contain configuration objects.
-const MAX_CHECKPOINT_DEPTH: usize = 256;
+/// Deepest nesting of unfinished lists, dicts and tuples; checkpoints contain configuration objects.
+const MAX_DEPTH: usize = 256;
 const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers the storages.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
@@ -20,7 +18,6 @@ const NO_OPERANDS: &str = "an opcode without its operands";
 pub(crate) struct Unpickler<'a> {
     bytes: &'a [u8],
     at: usize,
-    unknown: UnknownClasses,
     pub values: Vec<Value>,
     stack: Vec<ValueId>,
     marks: Vec<usize>,
@@ -30,8 +27,8 @@ pub(crate) struct Unpickler<'a> {
 
 impl<'a> Unpickler<'a> {
     /// Reads a pickle; returns the outermost value and the unpickler that holds all values.
-    pub fn read(bytes: &'a [u8], unknown: UnknownClasses) -> Result<(ValueId, Self), UnpickleError> {
-        let mut unpickler = Self { bytes, unknown, ..Self::default() };
+    pub fn read(bytes: &'a [u8]) -> Result<(ValueId, Self), UnpickleError> {
+        let mut unpickler = Self { bytes, ..Self::default() };
         match unpickler.run() {
             Ok(root) => Ok((root, unpickler)),
             Err(UnpickleError::Bad(what)) => Err(format!("{what} (at byte {})", unpickler.at).into()),
@@ -60,9 +57,8 @@ impl<'a> Unpickler<'a> {
             },
             0x95 => drop(self.take(8)?),
             b'(' => {
-                let max_depth = if self.skips_unknown() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
-                if self.marks.len() == max_depth {
-                    return Err(format!("nested deeper than {max_depth} levels").into());
+                if self.marks.len() == MAX_DEPTH {
+                    return Err(format!("nested deeper than {MAX_DEPTH} levels").into());
                 }
                 self.marks.push(self.stack.len());
             }
@@ -151,10 +147,9 @@ impl<'a> Unpickler<'a> {
         self.push(value)
     }
 
-    /// Handles the opcodes that occur in checkpoints but not in chunks: objects of any class, sets and bytes. All are skipped.
+    /// Handles the opcodes of objects of any class, sets and bytes, all of which are skipped.
     fn skip_object(&mut self, opcode: u8) -> Result<(), UnpickleError> {
         match opcode {
-            _ if !self.skips_unknown() => return Err(unknown_opcode(opcode)),
             // BUILD: sets the state of the object below it.
             b'b' => {
                 self.pop()?;
@@ -195,17 +190,13 @@ impl<'a> Unpickler<'a> {
                 let top = self.top()?;
                 self.stack.push(top);
             }
-            _ => return Err(unknown_opcode(opcode)),
+            _ => return Err(format!("opcode {opcode:#04x}, which torch.save does not write").into()),
         }
         Ok(())
     }
 
-    fn skips_unknown(&self) -> bool {
-        self.unknown == UnknownClasses::Skip
-    }
-
     fn push_global(&mut self, module: &str, name: &str) -> Result<(), UnpickleError> {
-        let value = if let Some(global) = global(module, name, self.unknown)? {
+        let value = if let Some(global) = global(module, name)? {
             Value::Global(global)
         } else {
             if self.skipped_objects.len() < MAX_SKIPPED_OBJECTS {
@@ -229,10 +220,9 @@ impl<'a> Unpickler<'a> {
         Ok(())
     }
 
-    /// Pushes a value; a skipped object instead of an error, if unknown classes are skipped.
+    /// Pushes a value, or a skipped object instead of an error.
     fn push_or_skip(&mut self, value: Result<Value, UnpickleError>) -> Result<(), UnpickleError> {
-        let value = if self.skips_unknown() { value.unwrap_or(Value::Opaque) } else { value? };
-        self.push(value)
+        self.push(value.unwrap_or(Value::Opaque))
     }
 
     fn pop(&mut self) -> Result<ValueId, UnpickleError> {
@@ -312,8 +302,8 @@ impl<'a> Unpickler<'a> {
         let mut extended = [if is_negative { 0xff } else { 0 }; 8];
         match extended.get_mut(..length) {
             Some(low) => low.copy_from_slice(digits),
-            None if self.skips_unknown() => return Ok(Value::Opaque),
-            None => return Err("an integer of more than 64 bits".into()),
+            // More than 64 bits.
+            None => return Ok(Value::Opaque),
         }
         Ok(Value::Int(i64::from_le_bytes(extended)))
     }
@@ -386,19 +376,6 @@ impl<'a> Unpickler<'a> {
     }
 }
 
-fn unknown_opcode(opcode: u8) -> UnpickleError {
-    format!("opcode {opcode:#04x}, which torch.save does not write").into()
-}
-
-/// Treatment of objects whose classes are not on the allow-list.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) enum UnknownClasses {
-    #[default]
-    Refuse,
-    /// The objects are skipped, as [`Value::Opaque`](crate::torch::values::Value::Opaque).
-    Skip,
-}
-
 pub(crate) enum UnpickleError {
     /// A Python name that is not allowed.
     Refused(String),
@@ -412,7 +389,7 @@ impl<S: Into<String>> From<S> for UnpickleError {
 }
 
 /// Looks a Python name up in the allow-list; `None` for a name whose objects are skipped.
-pub(crate) fn global(module: &str, name: &str, unknown: UnknownClasses) -> Result<Option<Global>, UnpickleError> {
+pub(crate) fn global(module: &str, name: &str) -> Result<Option<Global>, UnpickleError> {
     let known = match (module, name) {
         ("torch._utils", "_rebuild_tensor_v2") => Some(Global::RebuildTensor),
         ("collections", "OrderedDict") => Some(Global::OrderedDict),
@@ -426,7 +403,7 @@ pub(crate) fn global(module: &str, name: &str, unknown: UnknownClasses) -> Resul
     if known.is_some() {
         return Ok(known);
     }
-    if unknown == UnknownClasses::Refuse || is_attack(module, name) {
+    if is_attack(module, name) {
         return Err(UnpickleError::Refused(escaped_name(module, name)));
     }
     Ok(match (module, name) {
@@ -482,7 +459,7 @@ mod tests {
                       osgeo.osr.SpatialReference pathlib.PosixPath";
         for (names, is_refused) in [(attacks, true), (others, false)] {
             for (module, name) in names.split(' ').map(|name| name.rsplit_once('.').unwrap()) {
-                let found = global(module, name, UnknownClasses::Skip);
+                let found = global(module, name);
                 assert_eq!(matches!(found, Err(UnpickleError::Refused(_))), is_refused, "{module}.{name}");
             }
         }

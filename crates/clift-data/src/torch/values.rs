@@ -22,9 +22,9 @@ pub enum ElementType {
     F32,
     /// `torch.DoubleStorage`
     F64,
-    /// `torch.HalfStorage`, in checkpoints only.
+    /// `torch.HalfStorage`,.
     F16,
-    /// `torch.BFloat16Storage`, in checkpoints only.
+    /// `torch.BFloat16Storage`,.
     BF16,
 }
 
@@ -44,7 +44,7 @@ impl ElementType {
 pub enum Global {
     /// `torch._utils._rebuild_tensor_v2`
     RebuildTensor,
-    /// `torch._utils._rebuild_parameter`, or `_rebuild_parameter_with_state`, in checkpoints only.
+    /// `torch._utils._rebuild_parameter`, or `_rebuild_parameter_with_state`,.
     RebuildParameter,
     /// `collections.OrderedDict`
     OrderedDict,
@@ -97,6 +97,6 @@ pub enum Value {
     Global(Global),
     Storage(Box<Storage>),
     Tensor(Box<Tensor>),
-    /// A skipped object of an unknown class in a checkpoint.
+    /// A skipped object of an unknown class.
     Opaque,
 }

@@ -39,7 +39,7 @@ pub struct EvalConfig {
     pub num_context: usize,
     /// Target views of a scene without an index.
     pub num_targets: usize,
-    /// Number of scenes with a contact sheet. The report has figures of these scenes, at most six.
+    /// Number of scenes with a contact sheet. The report shows the first six.
     pub num_sheets: usize,
     /// Steps between validations during training; 0 for no validation.
     pub every: u64,

@@ -182,6 +182,8 @@ impl Evaluator {
     /// Returns the formats of the stored tokens, without coded ones if the model has no codec.
     fn formats(&self, models: &EvalModels, progress: &mut dyn EvalProgress) -> Result<Vec<TokenCoding>, EvalError> {
         let mut formats = self.sweep.eval.formats.clone();
+        let mut seen = BTreeSet::new();
+        formats.retain(|format| seen.insert(*format));
         let is_coded = |format: &TokenCoding| matches!(format, TokenCoding::Coded(_));
         if let Some(coded) = formats.iter().copied().find(is_coded).filter(|_| models.codec.is_none()) {
             let fix = "the model has no token codec: fit it with `clift codec RUN`";
@@ -257,6 +259,9 @@ pub struct SceneLimits {
 /// without clusters stores and renders all tokens.
 fn check_counts(eval: &EvalConfig, fewest_tokens: usize, architecture: Architecture) -> Result<(), EvalError> {
     let bad = |key, value: String, fix| Err(ModelError::BadConfig { key, value, fix }.into());
+    if eval.formats.is_empty() {
+        return bad("eval.formats", "[]".into(), "write at least one format".into());
+    }
     if !architecture.supports_clusters() {
         let Some(count) = eval.render.first() else { return Ok(()) };
         let fix = format!("views of {architecture} are rendered from all tokens: write []");

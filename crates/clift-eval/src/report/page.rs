@@ -112,7 +112,7 @@ impl Report {
         };
         Ok(html! {
             h2 { "Images of scenes" }
-            @if self.sheets.is_empty() { p.none { "No figures: " code { "eval.num_sheets" } " is 0." } }
+            @if self.sheets.is_empty() { p.none { "No contact sheets: see " code { "eval.num_sheets" } "." } }
             @for (key, sheet) in self.sheets.iter().take(MAX_FIGURES) {
                 article.scene { img alt=(format!("Contact sheet of {key}")) src=(data_uri(sheet)?); }
             }

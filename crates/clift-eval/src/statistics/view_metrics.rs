@@ -92,6 +92,7 @@ pub(crate) type Metric = fn(&ViewMetrics) -> Option<f64>;
 
 /// PSNR as it counts in a mean, at most [`PSNR_CAP_DB`].
 pub(crate) const PSNR: Metric = |view| Some(view.psnr.min(PSNR_CAP_DB));
+/// PSNR, SSIM, LPIPS and sharpness, the order in which their means are taken apart.
 pub(crate) const METRICS: [Metric; 4] = [PSNR, |view| view.ssim, |view| view.lpips_vgg, |view| view.sharpness];
 
 /// Returns the mean over the views of a scene that have the metric, by target frame; `None` without one.

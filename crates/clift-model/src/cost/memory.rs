@@ -1,13 +1,13 @@
 //! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/guide/training.md).
 // x = N D: f32 values of the rows of a block
 
+use crate::cost::largest_tensor::kmeans_values;
 use crate::cost::parameters::Parameters;
 use crate::cost::scene_sizes::SceneSizes;
 use crate::network::blocks::feed_forward::Activation;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Rows, TARGETS_AND_TOKENS};
 use crate::ops::precision::Precision;
-use crate::tokens::kmeans::seeding::{MAX_TABLE_LEN, pool_len};
 
 const F32: f64 = 4.0;
 /// Bytes of the C library's heap per byte that a backward pass keeps: the heap holds on to freed pieces below 32 MiB.
@@ -230,8 +230,7 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     let rows = values(sizes.num_encoder_rows);
     let encode = (rows + forward_values(config, rows)).max(2.5 * patches + rows);
     // Centered tokens, and the table of distances that the seeding reads.
-    let pool = |num_clusters| pool_len(sizes.num_tokens, num_clusters, MAX_TABLE_LEN);
-    let distances = |num_clusters| 2.0 * x + (pool(num_clusters) as u64 * sizes.num_tokens as u64) as f64;
+    let distances = |num_clusters| 2.0 * x + kmeans_values(sizes.num_tokens, num_clusters) as f64;
     let kmeans = sizes.num_clusters.map_or(0.0, distances);
     let render = match sizes.num_targets {
         0 => 0.0,

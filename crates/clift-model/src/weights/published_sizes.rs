@@ -31,9 +31,13 @@ pub fn infer_config<'a>(
         let size = shapes.get(key)?.first()?;
         usize::try_from(*size).ok().filter(|size| *size > 0)
     };
-    let first = |ending: &str| {
+    // The most frequent size: one misshapen tensor does not change it.
+    let common = |ending: &str| {
         let is_layer = |key: &str| key.starts_with("decoder.layers.") || key.starts_with("encoder.layers.");
-        shapes.keys().copied().find(|key| is_layer(key) && key.ends_with(ending) && size(key).is_some())
+        let mut counts = BTreeMap::<usize, usize>::new();
+        let keys = shapes.keys().copied().filter(|key| is_layer(key) && key.ends_with(ending));
+        keys.filter_map(size).for_each(|size| *counts.entry(size).or_insert(0) += 1);
+        counts.into_iter().rev().max_by_key(|(_, count)| *count).map(|(size, _)| size)
     };
     // One more than the largest number of a layer with at least half of the keys of the layer with the most: single stray keys do
     // not count.
@@ -50,7 +54,7 @@ pub fn infer_config<'a>(
         last.map(|(number, _)| number.saturating_add(1))
     };
     let published = ModelConfig::default();
-    let dim = first(".norm1.weight").and_then(size).unwrap_or(published.dim);
+    let dim = common(".norm1.weight").unwrap_or(published.dim);
     let head_width = size("encoder.layers.0.self_attn.q_norm.weight").filter(|size| dim.is_multiple_of(*size));
     let num_heads = num_heads.or(head_width.filter(|_| variant.has_norms()).map(|size| dim / size));
     let has_condenser = shapes.keys().any(|key| key.starts_with("squeezer."));
@@ -63,7 +67,7 @@ pub fn infer_config<'a>(
         variant,
         dim,
         num_heads: num_heads.unwrap_or(published.num_heads),
-        feed_forward_dim: first(".linear1.weight").and_then(size).unwrap_or(published.feed_forward_dim),
+        feed_forward_dim: common(".linear1.weight").unwrap_or(published.feed_forward_dim),
         num_encoder_blocks: count("encoder.layers.").unwrap_or(published.num_encoder_blocks),
         num_renderer_blocks: count("decoder.layers.").unwrap_or(published.num_renderer_blocks),
         // RGB of every pixel of a patch.

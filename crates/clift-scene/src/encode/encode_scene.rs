@@ -68,7 +68,7 @@ pub fn encode_scene(
     let (frame_names, num_frames) = (reader.source.frame_names(index)?, reader.source.num_frames(index)?);
     let codec = codec_for(options.coding, &options.weights, model)?;
     let mut encoded = encode(model, reader, index, &options.encode)?;
-    if options.refine_steps > 0 && encoded.scene.groups.len() > 1 {
+    if options.refine_steps > 0 && encoded.scene.groups.len() > 1 && encoded.scene.model.has_patch_tokens() {
         let EncodedScene { scene, context, .. } = &mut encoded;
         refine(model, context, scene, (options.refine_steps, options.encode.seed), progress)?;
     }

@@ -6,8 +6,10 @@
 
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
-use clift_core::{ClipViews, Pose, ViewDistance, derive_seed, step_rng, uniform_below};
+use clift_core::{ClipViews, Pose, ViewDistance, derive_seed, step_rng};
 use clift_model::{Cameras, ModelError, Renderer, Tokens, TrainedModel, Views};
+use rand::RngExt;
+use rand::distr::weighted::WeightedIndex;
 
 use crate::error::SceneError;
 use crate::scene::scene::{ContextGroup, Scene};
@@ -30,6 +32,7 @@ pub(crate) fn refine(
 ) -> Result<(), SceneError> {
     let renderer = model.network.renderer.clone().train().no_grad();
     let photos = photos_of_groups(scene);
+    progress(0, photos.len());
     let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
     let mut first_patch = 0;
     for (i, positions) in scene.tokens_of_groups().iter().enumerate() {
@@ -39,7 +42,7 @@ pub(crate) fn refine(
         for step in 0..steps {
             let chosen = choose(&photos[i], seed, step);
             let target = ContextGroup { views: chosen, frame: group.frame }.members(context);
-            fit.step(&renderer, &target, model, step as f64 / steps as f64)?;
+            fit.step(&renderer, &target, model, [step, steps])?;
         }
         first_patch += (group.views.len() * patches_per_view) as u32;
         let (dim, values) = (scene.model.dim, fit.tokens.to_host()?);
@@ -52,7 +55,7 @@ pub(crate) fn refine(
 }
 
 /// Returns the photos that every group is fitted to, with their weights: its own views, and views of other groups of which it
-/// has a share when they are rendered without the groups that they belong to.
+/// has a share when they are rendered without the groups that they belong to, up to twice as far as its own views are.
 fn photos_of_groups(scene: &Scene) -> Vec<Vec<(u32, f64)>> {
     let poses: Vec<Pose> = scene.context.iter().map(|camera| camera.c2w).collect();
     let distance = ViewDistance::new(&poses);
@@ -61,11 +64,14 @@ fn photos_of_groups(scene: &Scene) -> Vec<Vec<(u32, f64)>> {
     for (view, pose) in poses.iter().enumerate() {
         let others: Vec<usize> =
             (0..photos.len()).filter(|&group| !scene.groups[group].views.contains(&(view as u32))).collect();
-        let to_group = |&group: &usize| {
-            distance.to_group(pose, scene.groups[group].views.iter().map(|&member| &poses[member as usize]))
-        };
-        for (i, share) in group_shares(&others.iter().map(to_group).collect::<Vec<_>>()) {
-            photos[others[i]].push((view as u32, share));
+        let members = |group: usize| scene.groups[group].views.iter().map(|&member| &poses[member as usize]);
+        let distances: Vec<f64> = others.iter().map(|&group| distance.to_group(pose, members(group))).collect();
+        for (i, share) in group_shares(&distances) {
+            let group = others[i];
+            let reach = members(group).map(|own| distance.to_group(own, members(group))).fold(0.0, f64::max);
+            if distances[i] <= 2.0 * reach {
+                photos[group].push((view as u32, share));
+            }
         }
     }
     photos
@@ -73,19 +79,9 @@ fn photos_of_groups(scene: &Scene) -> Vec<Vec<(u32, f64)>> {
 
 /// Draws the photos of a step with replacement, in proportion to their weights.
 fn choose(photos: &[(u32, f64)], seed: u64, step: usize) -> Vec<u32> {
-    const LEVELS: usize = 1 << 20;
-    let sum: f64 = photos.iter().map(|(_, weight)| weight).sum();
-    let mut rng = step_rng(seed, step as u64, "photos");
-    let mut draw = || {
-        let mut left = uniform_below(&mut rng, LEVELS) as f64 / LEVELS as f64 * sum;
-        let passed = |(_, weight): &&(u32, f64)| {
-            left -= weight;
-            left >= 0.0
-        };
-        let position = photos.iter().take_while(passed).count();
-        photos[position.min(photos.len() - 1)].0
-    };
-    (0..PHOTOS_PER_STEP).map(|_| draw()).collect()
+    let weights = WeightedIndex::new(photos.iter().map(|(_, weight)| weight)).expect("own views have a weight");
+    let drawn = step_rng(seed, step as u64, "photos").sample_iter(weights);
+    drawn.take(PHOTOS_PER_STEP).map(|position| photos[position].0).collect()
 }
 
 /// The tokens of a group and the moments of Adam.
@@ -94,8 +90,8 @@ struct GroupFit {
     tokens: Tokens,
     mean: Tensor<3>,
     square: Tensor<3>,
+    /// Root mean square of the values.
     scale: f64,
-    num_steps: i32,
 }
 
 impl GroupFit {
@@ -115,16 +111,16 @@ impl GroupFit {
         let cameras = Cameras::of_views(&scene.group_cameras(group), scene.height, scene.width, device)?;
         let (mean, square) = (Tensor::zeros_like(&values), Tensor::zeros_like(&values));
         let tokens = Tokens::of_patches(&scene.model, values, &cameras, &patches);
-        Ok(Self { tokens, mean, square, scale, num_steps: 0 })
+        Ok(Self { tokens, mean, square, scale })
     }
 
-    /// Makes a step of Adam for the mean squared error of `target`; `passed` is the part of all steps before it.
+    /// Makes a step of Adam, from 0, of `num_steps` for the mean squared error of `target`.
     fn step(
         &mut self,
         renderer: &Renderer,
         target: &ClipViews,
         model: &TrainedModel,
-        passed: f64,
+        [step, num_steps]: [usize; 2],
     ) -> Result<(), ModelError> {
         const DECAY: [f64; 2] = [0.9, 0.99];
         let views = Views::upload(&[target], &model.device.clone().autodiff())?;
@@ -132,12 +128,12 @@ impl GroupFit {
         let image = renderer.forward(self.tokens.with_values(values.clone()), &views.cameras);
         let gradients = (image - views.images).powi_scalar(2).mean().backward();
         let gradient = values.grad(&gradients).expect("the image depends on the tokens");
-        self.num_steps += 1;
         self.mean = self.mean.clone() * DECAY[0] + gradient.clone() * (1.0 - DECAY[0]);
         self.square = self.square.clone() * DECAY[1] + gradient.powi_scalar(2) * (1.0 - DECAY[1]);
-        let [first, second] = DECAY.map(|decay| 1.0 - decay.powi(self.num_steps));
-        let step = self.mean.clone() / first / ((self.square.clone() / second).sqrt() + 1e-12);
-        let values = self.tokens.values.clone() - step * (RATE * self.scale * (1.0 - passed));
+        let [first, second] = DECAY.map(|decay| 1.0 - decay.powi(step as i32 + 1));
+        let direction = self.mean.clone() / first / ((self.square.clone() / second).sqrt() + 1e-12);
+        let rate = RATE * self.scale * (1.0 - step as f64 / num_steps as f64);
+        let values = self.tokens.values.clone() - direction * rate;
         self.tokens = self.tokens.with_values(values);
         Ok(())
     }
@@ -157,13 +153,5 @@ mod tests {
             assert_eq!(own.take(group.views.len()).collect::<Vec<_>>(), group.views);
             assert!(photos[group.views.len()..].iter().all(|(view, _)| !group.views.contains(view)), "{photos:?}");
         }
-    }
-
-    #[test]
-    fn photos_are_drawn_in_proportion_to_their_weights() {
-        let photos = [(7, 0.5), (3, 1.5), (5, 0.0)];
-        let drawn: Vec<u32> = (0..2000).flat_map(|step| choose(&photos, 1, step)).collect();
-        let share = |photo| drawn.iter().filter(|&&drawn| drawn == photo).count() as f64 / drawn.len() as f64;
-        assert!((share(7) - 0.25).abs() < 0.02 && (share(3) - 0.75).abs() < 0.02 && share(5) == 0.0);
     }
 }

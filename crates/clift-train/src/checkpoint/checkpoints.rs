@@ -286,6 +286,15 @@ mod tests {
     }
 
     #[test]
+    fn a_panic_is_not_called_damage() {
+        let error = caught(Path::new(OPTIMIZER), || panic!("no adapter")).map(|(): ()| ()).unwrap_err();
+        assert!(
+            matches!(error, TrainError::Io { .. }) && error.to_string().contains("Burn panicked: no adapter"),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn foreign_optimizer_and_missing_checksum_are_refused() {
         let place = tempfile::tempdir().unwrap();
         let (mut train_state, checkpoints, step) = saved(place.path());

@@ -107,7 +107,9 @@ fn evaluation_macs(config: &Config) -> Result<f64, TrainError> {
         let scene = SceneSizes { num_storage_tokens: Some(count), num_render_tokens: count, ..scene };
         macs += part_macs(config, Part::Condenser, &scene);
         for num_render_tokens in planned.token_counts(count) {
-            macs += part_macs(config, Part::Renderer, &SceneSizes { num_render_tokens, ..scene });
+            let scene = SceneSizes { num_render_tokens, ..scene };
+            let of_views = config.model.render_views_macs(config.data.height, config.data.width, &scene)?;
+            macs += of_views.count(FlopConvention::Macs) as f64;
         }
     }
     Ok(eval.num_scenes as f64 * macs)

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use burn::module::Module;
 use burn::store::PathFilter;
+use clift_core::replace_file;
 use clift_model::{DeviceName, ModelPath, Network, TrainedModel, save_part_f16};
 
 use crate::config::config::Config;
@@ -21,8 +22,8 @@ pub fn export_f16(config: &Config, model: &ModelPath, folder: &Path) -> Result<u
     publish_model_dir(folder, |written| {
         save_part_f16(&trained.network, &part, &written.weights)?;
         let (from, to) = (model.dir.join("config.toml"), written.dir.join("config.toml"));
-        std::fs::copy(&from, to).map_err(TrainError::io("copying the config of the model", &from))?;
-        Ok(())
+        let text = std::fs::read(&from).map_err(TrainError::io("reading the config of the model", &from))?;
+        replace_file(&to, &text).map_err(TrainError::io("writing the model directory", &to))
     })?;
     let condenser = if trained.has_condenser { 0 } else { trained.network.condenser.num_params() };
     Ok(trained.network.num_params() - condenser)

@@ -14,12 +14,13 @@ use crate::run::lock::{FITTED_RUN, RUN, RunLock, has_other_files};
 use crate::version::parse_versioned;
 
 const FILE: &str = "run.json";
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 const FREE_KEYS: [&str; 7] =
     ["run_dir", "device", "data.num_threads", "data.num_prefetch", "model.patch_grids", "checkpoint.", "eval."];
 
 #[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct RunFile {
     version: u32,
 }

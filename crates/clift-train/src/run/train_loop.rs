@@ -150,7 +150,7 @@ impl TrainLoop<'_> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
         // The first step of a new stage is not measured: it may compile kernels.
-        let (is_new, mut measured) = (self.progress.step == 0, None::<Instant>);
+        let (is_new, mut measured, mut asked) = (self.progress.step == 0, 0.0, Instant::now());
         for batch in self.plan.prefetch(self.progress.step) {
             // Also an error of another rank.
             let batch = batch.and_then(|batch| {
@@ -163,9 +163,11 @@ impl TrainLoop<'_> {
             };
             train_state = self.step(train_state, &batch, &scenes)?;
             let (stage, step) = (self.plan.settings.stage, self.progress.step);
-            let seconds = measured.get_or_insert_with(Instant::now).elapsed().as_secs_f64();
+            if step > 1 {
+                measured += asked.elapsed().as_secs_f64();
+            }
             if is_new && step == PACE_STEPS {
-                self.log.event(&Event::Pace { stage, step, step_s: seconds / (PACE_STEPS - 1) as f64 });
+                self.log.event(&Event::Pace { stage, step, step_s: measured / (PACE_STEPS - 1) as f64 });
             }
             let is_stopped = self.plan.ranks.any(self.stop.load(Ordering::Relaxed))?;
             if is_stopped || self.is_checkpoint_due() {
@@ -177,6 +179,7 @@ impl TrainLoop<'_> {
             if let Err(error) = self.validate_if_due(&train_state) {
                 return Err(self.save_before(error, &train_state));
             }
+            asked = Instant::now();
         }
         self.log.check()?;
         Ok(train_state.model)

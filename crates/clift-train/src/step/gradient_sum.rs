@@ -31,8 +31,12 @@ impl GradientSum {
         let mut flatten = Flatten { grads, has_gradient: Vec::new(), flat: Vec::new() };
         module.visit(&mut flatten);
         let Flatten { has_gradient, flat, .. } = flatten;
-        let values = if flat.is_empty() { Ok(Vec::new()) } else { Tensor::cat(flat, 0).try_into_vec_as::<f32>() };
-        let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
+        let mut values = Vec::new();
+        // A few at once: a device limits the size of a tensor.
+        for some in flat.chunks(8) {
+            let some = Tensor::cat(some.to_vec(), 0).try_into_vec_as::<f32>();
+            values.extend(some.map_err(|error| TrainError::Device { reason: error.to_string() })?);
+        }
         let all = ranks.gather((has_gradient, values.len()))?;
         if let Some(rank) = (0..num_working).find(|&rank| all[rank] != all[0]) {
             return Err(TrainError::RanksDiffer { what: "the trained parameters", rank });

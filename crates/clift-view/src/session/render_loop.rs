@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_core::RgbImage;
+use clift_core::{Camera, RgbImage};
 use clift_data::{encode_jpeg, encode_png};
 use clift_eval::Canvas;
 use clift_model::{PatchGrids, SelectionPreset, psnr};
@@ -32,6 +32,8 @@ pub struct RenderLoop {
     /// The scenes opened last, the latest at the end.
     open: Vec<Arc<OpenScene>>,
     views: HashMap<ClientId, ClientView>,
+    /// The true image read last, with its scene and frame.
+    true_image: Option<([usize; 2], (Canvas, Camera))>,
 }
 
 /// The scene of a client, and the token selection and time of its previous frames.
@@ -44,7 +46,7 @@ struct ClientView {
 
 impl RenderLoop {
     pub fn new(scenes: SceneSet, device: Device) -> Self {
-        Self { scenes, device, open: Vec::new(), views: HashMap::new() }
+        Self { scenes, device, open: Vec::new(), views: HashMap::new(), true_image: None }
     }
 
     /// Works until the clients are closed.
@@ -131,7 +133,11 @@ impl RenderLoop {
 
     fn compare(&mut self, id: ClientId, request: &CompareRequest) -> Result<Vec<u8>, ViewError> {
         let scene = self.views.get(&id).ok_or(ViewError::NoScene)?.scene.clone();
-        let (image, camera) = self.scenes.true_image(&scene, request.frame)?;
+        let key = [scene.index, request.frame];
+        let (image, camera) = match self.true_image.take().filter(|(kept, _)| *kept == key) {
+            Some((_, read)) => read,
+            None => self.scenes.true_image(&scene, request.frame)?,
+        };
         let [width, height] = [scene.scene.width, scene.scene.height];
         let tokens = request.tokens.clamp(1, scene.scene.num_tokens());
         let mut renderer = scene.renderer.clone();
@@ -148,6 +154,7 @@ impl RenderLoop {
         });
         let true_png = if request.image { vec![png(&image)?] } else { Vec::new() };
         let parts: Vec<&[u8]> = true_png.iter().map(Vec::as_slice).collect();
+        self.true_image = Some((key, (image, camera)));
         Ok(message("comparison", comparison, &parts))
     }
 }

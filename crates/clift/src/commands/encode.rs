@@ -16,7 +16,7 @@ use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::UsageError;
 use crate::output::counter::Counter;
 use crate::output::output_file::OutputFile;
-use crate::output::stdout::print_note;
+use crate::output::stdout::{print_note, print_warning};
 use crate::output::written_scene::print_scene;
 
 #[derive(Debug, clap::Args)]
@@ -59,7 +59,7 @@ pub struct EncodeArgs {
     pub hold_out: usize,
     /// Tokens to store, as a number or a share [default: 1/4]
     ///
-    /// With many groups the default falls to 1/8. Few groups, which leave photos out, hold a number less than 32 a group.
+    /// With many groups the default falls to 1/8. A number below 32 tokens a group makes fewer groups, which leave photos out.
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
     /// Format of the tokens: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]
@@ -70,8 +70,8 @@ pub struct EncodeArgs {
     pub format: Option<TokenCoding>,
     /// Fit the tokens to the photos of a capture, in this many steps, such as 30
     ///
-    /// Gradient descent through the renderer, for every group of neighbours: less blur between the photos, at about ten times
-    /// the time.
+    /// Gradient descent through the renderer, for every group of neighbours: views between the photos are nearer to the truth,
+    /// in about fifteen times the time.
     #[arg(long, value_name = "STEPS", default_value_t = 0, hide_default_value = true)]
     pub refine: usize,
     #[command(flatten)]
@@ -129,9 +129,12 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let reader = ClipReader { source, options: options_of_views };
     let mut counter = None;
     let mut progress = |done: usize, total: usize| {
-        counter.get_or_insert_with(|| Counter::new("groups refined", total as u64)).set(done as u64);
+        counter.get_or_insert_with(|| Counter::new("groups fitted", total as u64)).set(done as u64);
     };
     let written = encode_scene(&model_args.open()?, &reader, scene, &options, &mut progress)?;
+    if args.refine > 0 && counter.is_none() {
+        print_warning("--refine: the scene is one group of views, whose tokens are not fitted");
+    }
     drop(counter);
     // Contexts of a run's own data show how well it is trained, not how far apart they are.
     print_scene(&written, &args.out, &given.display().to_string(), model_args.folder.is_some())

@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use clap::builder::PossibleValuesParser;
 use clift_model::ModelPath;
 use clift_train::{Config, export_f16, read_config, require_absent};
 
@@ -13,9 +12,6 @@ pub struct ExportArgs {
     /// Model directory, run directory, or model.safetensors in one of them
     #[arg(value_name = "MODEL|RUN")]
     pub model: PathBuf,
-    /// Format: f16, a model directory with the weights rounded to f16; fit its token codec with `clift codec`
-    #[arg(long, value_name = "FORMAT", value_parser = PossibleValuesParser::new(["f16"]))]
-    pub format: String,
     /// Model directory to write
     #[arg(long, short, value_name = "DIR")]
     pub out: PathBuf,

@@ -18,7 +18,7 @@ pub fn print_scene(written: &WrittenScene, out: &Path, model: &str, is_capture: 
     print_result(&describe(written, out))?;
     let psnrs: Vec<f64> = written.contexts.iter().map(|view| view.psnr).collect();
     let psnr = clift_core::mean(&psnrs).unwrap_or_default();
-    print_result(&format!("check: the context views are rendered at {psnr:.2} dB"))?;
+    print_result(&format!("check: {} rendered at {psnr:.2} dB", plural(psnrs.len(), "context view")))?;
     let fog = written.contexts.iter().filter(|view| view.is_fog());
     let fog: Vec<String> = fog.map(|view| written.frame_name(view.frame)).collect();
     if is_capture && !fog.is_empty() {

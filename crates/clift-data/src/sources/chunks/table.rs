@@ -58,7 +58,7 @@ impl ChunkTable {
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let archive = Archive::open(path)?;
-        let pickle = Pickle::parse_checkpoint(&archive.read_pickle(path)?, path)?;
+        let pickle = Pickle::parse(&archive.read_pickle(path)?, path)?;
         // A chunk is a list of scenes; files of one scene hold its dict.
         let scenes: Vec<&Value> = match pickle.root() {
             Value::List(items) => items.iter().map(|id| pickle.get(*id)).collect(),

@@ -1,5 +1,6 @@
 //! Images named by a camera file, wherever they are.
 
+use std::borrow::Cow;
 use std::path::{Component, Path, PathBuf};
 
 use percent_encoding::percent_decode_str;
@@ -51,9 +52,12 @@ impl<'a> ImageLocator<'a> {
     /// Returns the path of an image, or why there is none. The name may have the separators of Windows or the `%20` of a URL,
     /// begin with the image folder, or be an absolute path of another computer, of which as many last parts count as exist.
     pub fn find(&mut self, name: &str) -> Result<PathBuf, String> {
-        let name = name.replace('\\', "/");
-        let decoded = percent_decode_str(&name).decode_utf8().ok().filter(|decoded| *decoded != name);
-        self.find_as(&name).or_else(|error| self.find_as(&decoded.ok_or_else(|| error.clone())?).map_err(|_| error))
+        let slashes = name.replace('\\', "/");
+        let decoded = percent_decode_str(&slashes).decode_utf8().ok().map(Cow::into_owned);
+        self.find_as(name).or_else(|error| {
+            let others = [Some(slashes.clone()), decoded].into_iter().flatten().filter(|other| other != name);
+            others.into_iter().find_map(|other| self.find_as(&other).ok()).ok_or(error)
+        })
     }
 
     fn find_as(&mut self, name: &str) -> Result<PathBuf, String> {
@@ -71,9 +75,11 @@ impl<'a> ImageLocator<'a> {
             }
         } else {
             candidates.push(self.image_folder.join(named));
-            let is_named = name.trim_start_matches("./").starts_with("images") && self.image_folder != self.folder;
-            if parts.len() > 1 && (self.is_chosen || is_named) {
-                candidates.push(self.image_folder.join(suffix(1)));
+            // `images/0.png`, `attic/images/0.png`.
+            let at_images = parts.iter().position(|part| part.as_os_str() == "images");
+            let is_named = at_images.is_some() || name.trim_start_matches("./").starts_with("images");
+            if parts.len() > 1 && (self.is_chosen || is_named && self.image_folder != self.folder) {
+                candidates.push(self.image_folder.join(suffix(at_images.map_or(1, |at| at + 1))));
             }
             candidates.extend((!self.is_chosen).then(|| self.folder.join(named)));
         }

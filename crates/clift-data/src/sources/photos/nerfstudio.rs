@@ -94,10 +94,10 @@ impl<'a> Frame<'a> {
     /// Returns the value of a key; `None` for a missing or null one. A focal length of the frame overrides an angle of the top
     /// level.
     fn value<T: Deserialize<'a>>(&self, key: &str) -> Result<Option<T>, String> {
-        let has_focal = FOCAL.contains(&key) && FOCAL.iter().any(|key| self.keys.contains_key(*key));
-        let given = |keys: &Keys<'a>| keys.get(key).copied().filter(|value| value.get() != "null");
-        let value = given(&self.keys).or_else(|| if has_focal { None } else { given(self.top) });
-        let malformed = |error: serde_json::Error| format!("whose entry is malformed: {}", of_value(&error));
+        let given = |keys: &Keys<'a>, key: &str| keys.get(key).copied().filter(|value| value.get() != "null");
+        let has_focal = FOCAL.contains(&key) && FOCAL.iter().any(|key| given(&self.keys, key).is_some());
+        let value = given(&self.keys, key).or_else(|| if has_focal { None } else { given(self.top, key) });
+        let malformed = |error: serde_json::Error| format!("whose entry is malformed: {} in `{key}`", of_value(&error));
         value.map(|value| serde_json::from_str(value.get())).transpose().map_err(malformed)
     }
 
@@ -238,22 +238,22 @@ impl<'a> Frame<'a> {
 
 /// Returns whether each of the frames of these names is held out of training: it is not in `train_filenames`, or is in
 /// `val_filenames` or `test_filenames`. `None` if these lists name no frame. Adds a note on names without a frame.
-fn held_out(top: &Keys<'_>, names: &[&str], notes: &mut Vec<String>) -> Option<Vec<bool>> {
+fn held_out(top: &Keys<'_>, names: &[&str], notes: &mut Vec<String>) -> Result<Option<Vec<bool>>, serde_json::Error> {
     let normal =
         |path: &str| path.split(['/', '\\']).filter(|part| !["", "."].contains(part)).collect::<Vec<_>>().join("/");
     let names: Vec<String> = names.iter().map(|name| normal(name)).collect();
     let frames: HashSet<&str> = names.iter().map(String::as_str).collect();
     let mut unknown = Vec::new();
-    let mut listed = |key: &str| -> HashSet<String> {
-        let items: Vec<&RawValue> =
-            top.get(key).and_then(|list| serde_json::from_str(list.get()).ok()).unwrap_or_default();
-        let listed = items.iter().filter_map(|item| serde_json::from_str::<String>(item.get()).ok());
+    let mut listed = |key: &str| -> serde_json::Result<HashSet<String>> {
+        let items: Option<Vec<&RawValue>> =
+            top.get(key).map(|list| serde_json::from_str(list.get())).transpose()?.flatten();
+        let listed = items.iter().flatten().filter_map(|item| serde_json::from_str::<String>(item.get()).ok());
         let (known, others): (Vec<_>, Vec<_>) =
             listed.map(|name| normal(&name)).partition(|name| frames.contains(name.as_str()));
         unknown.extend(others.iter().map(|name| shown(name)));
-        known.into_iter().collect()
+        Ok(known.into_iter().collect())
     };
-    let [train, val, test] = ["train_filenames", "val_filenames", "test_filenames"].map(&mut listed);
+    let [train, val, test] = [listed("train_filenames")?, listed("val_filenames")?, listed("test_filenames")?];
     if !unknown.is_empty() {
         let count = plural(unknown.len(), "name");
         notes.push(format!("{count} in the lists of file names without a frame ({})", first_few(&unknown)));
@@ -262,7 +262,7 @@ fn held_out(top: &Keys<'_>, names: &[&str], notes: &mut Vec<String>) -> Option<V
         if train.is_empty() { val.contains(name) || test.contains(name) } else { !train.contains(name) }
     };
     let has_lists = [&train, &val, &test].iter().any(|list| !list.is_empty());
-    has_lists.then(|| names.iter().map(is_held_out).collect())
+    Ok(has_lists.then(|| names.iter().map(is_held_out).collect()))
 }
 
 /// Reads a `transforms.json` and locates its images. Frames are in the natural order of their names.
@@ -293,7 +293,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     let mut images = ImageLocator::new(folder, options);
     let (mut used, mut scales, mut guessed) = (HashSet::new(), Vec::new(), Vec::new());
     let names: Vec<&str> = frames.iter().map(|frame| frame.name.as_str()).collect();
-    let held_out = held_out(&top, &names, &mut scene.notes);
+    let held_out = held_out(&top, &names, &mut scene.notes).map_err(expected)?;
     for (position, frame) in frames.iter().enumerate() {
         let photo = images.find(&frame.name).and_then(|image| {
             if !used.insert(image.clone()) {

@@ -21,7 +21,7 @@ use crate::sources::photos::scene_folder::SceneFolder;
 /// Largest number of photos in the cache, about 300 bytes each.
 const MAX_CACHED_PHOTOS: usize = 200_000;
 const MAX_CACHED_SCENES: usize = 256;
-/// Largest number of frames of a scene named in the report.
+/// Largest number of frames that are named in the report.
 const MAX_NAMED_FRAMES: usize = 10_000;
 
 const FAR: &str = "whose camera is farther away than 20 times the median step or distance";
@@ -88,7 +88,7 @@ impl PhotoSource {
         let checks_data = !options.whole_scenes && folders.len() <= MAX_CHECKED_SCENES;
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options, checks_data)).collect();
         let mut report = SkipReport::new(folders.len());
-        let (mut scenes, mut first_error) = (Vec::new(), None);
+        let (mut scenes, mut first_error, mut num_unnamed) = (Vec::new(), None, 0);
         let mut counted: [(usize, Vec<String>); COUNTED.len()] = Default::default();
         for (folder, findings) in folders.into_iter().zip(findings) {
             let Findings { entry, missing, counts, notes, reason } = match findings {
@@ -113,8 +113,15 @@ impl PhotoSource {
             }
             // Without any image, the reason of the scene covers all frames.
             for MissingPhoto { name, reason } in missing.into_iter().filter(|_| has_photos) {
-                report.skip_frame(&folder.key, name, reason);
+                if report.frames.len() < MAX_NAMED_FRAMES {
+                    report.skip_frame(&folder.key, name, reason);
+                } else {
+                    num_unnamed += 1;
+                }
             }
+        }
+        if num_unnamed > 0 {
+            report.notes.push(format!("{num_unnamed} more frames skipped"));
         }
         for (what, (total, scenes)) in COUNTED.iter().zip(counted).filter(|(_, (total, _))| *total > 0) {
             report.notes.push(format!("{} {what}: {}", plural(total, "image"), first_few(&scenes)));
@@ -304,7 +311,8 @@ impl SceneSource for PhotoSource {
         }
         let image = resize_lanczos(&image, width, height);
         let mut decoded = lock();
-        if (decoded.len() + 1) * image.rgb.len() <= MAX_DECODED_BYTES {
+        let num_bytes: usize = decoded.values().map(|image| image.rgb.len()).sum();
+        if num_bytes + image.rgb.len() <= MAX_DECODED_BYTES {
             decoded.insert((scene, frame), image.clone());
         }
         Ok((image, None))

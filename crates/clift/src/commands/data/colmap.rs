@@ -46,7 +46,8 @@ impl Colmap<'_> {
             let overlap = OVERLAP.to_string();
             self.run("sequential_matcher", "matches", &[], &[gpu, (&["SequentialMatching.overlap"], &overlap)])
         } else {
-            self.run("exhaustive_matcher", "matches", &[], &[gpu])
+            // COLMAP commits a block at its end: small ones, so that an interrupted command loses little.
+            self.run("exhaustive_matcher", "matches", &[], &[gpu, (&["ExhaustiveMatching.block_size"], "8")])
         }
     }
 
@@ -92,7 +93,7 @@ impl Colmap<'_> {
                 args.extend([format!("--{name}").into(), OsString::from(value)]);
             }
         }
-        print_note(&format!("COLMAP: {noun}"));
+        print_note(&format!("COLMAP: {noun}; {} has its progress", self.tool.log.display()));
         self.tool.run(&args)
     }
 }
