@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::packing::{lanes_of, pack_across, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
-use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::{Bf16, Operands, Simd};
+use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
+use crate::simd::vector::{Operands, Simd};
 
 /// Values along the inner dimension that are multiplied before the next ones. A panel of B takes 48 KB of the L2 cache, which
 /// reads it in less time than the tile multiplies; larger blocks read and write the sums less often.
@@ -42,19 +42,21 @@ pub fn matmul_bf16(
     if output.is_empty() {
         return;
     }
-    let mut width = 0;
-    set.run(PanelWidth(&mut width));
-    let lanes = lanes_of::<Bf16>(inner.min(INNER_BLOCK));
+    let mut sizes = [0; 2];
+    set.run_product(OperandType::Bf16, PanelSizes { inner: inner.min(INNER_BLOCK), to: &mut sizes });
+    let [lanes, width] = sizes;
     let layout = PackedB { lanes, width, num_panels: columns.div_ceil(width) };
     let mut packed = vec![0.0; layout.panel_len() * layout.num_panels * inner.div_ceil(INNER_BLOCK)];
     if !packed.is_empty() {
         packed.par_chunks_mut(layout.panel_len()).enumerate().for_each(|(i, to)| {
-            set.run(PackPanel { b, inner, columns, layout, index: [i / layout.num_panels, i % layout.num_panels], to });
+            let index = [i / layout.num_panels, i % layout.num_panels];
+            set.run_product(OperandType::Bf16, PackPanel { b, inner, columns, layout, index, to });
         });
     }
     let block = rows.div_ceil(4 * rayon::current_num_threads()).next_multiple_of(FEWEST_ROWS).min(ROW_BLOCK);
     output.par_chunks_mut(block * columns).enumerate().for_each(|(i, to)| {
-        set.run(RowBlock { a, packed: &packed, layout, sizes: [rows, inner, columns], first: i * block, bias, to });
+        let sizes = [rows, inner, columns];
+        set.run_product(OperandType::Bf16, RowBlock { a, packed: &packed, layout, sizes, first: i * block, bias, to });
     });
 }
 
@@ -72,12 +74,16 @@ impl PackedB {
     }
 }
 
-struct PanelWidth<'a>(&'a mut usize);
+/// Where the lanes of a block of the inner dimension and the width of a panel are written.
+struct PanelSizes<'a> {
+    inner: usize,
+    to: &'a mut [usize; 2],
+}
 
-impl Kernel for PanelWidth<'_> {
+impl Kernel for PanelSizes<'_> {
     #[inline(always)]
     fn run<S: Simd, O: Operands>(self, _simd: S) {
-        *self.0 = panel_width::<S>();
+        *self.to = [lanes_of::<S, O>(self.inner), panel_width::<S>()];
     }
 }
 
@@ -98,10 +104,10 @@ impl Kernel for PackPanel<'_> {
         let across = range(panel, layout.width, columns);
         if b.transposed {
             let rows = across.map(|column| &b.values[column * inner..][inside.clone()]);
-            pack_transposed::<S, Bf16>(simd, rows, [layout.lanes, layout.width], to);
+            pack_transposed::<S, O>(simd, rows, [layout.lanes, layout.width], to);
         } else {
             let rows = inside.map(|row| &b.values[row * columns..][across.clone()]);
-            pack_across::<S, Bf16>(simd, rows, layout.width, to);
+            pack_across::<S, O>(simd, rows, layout.width, to);
         }
     }
 }
@@ -140,20 +146,20 @@ impl Kernel for RowBlock<'_> {
         }
         for block in 0..inner.div_ceil(INNER_BLOCK) {
             let inside = range(block, INNER_BLOCK, inner);
-            let lanes = lanes_of::<Bf16>(inside.len());
+            let lanes = lanes_of::<S, O>(inside.len());
             if a.transposed {
                 let rows = inside.map(|row| &a.values[row * rows..][first..first + count]);
-                pack_across::<S, Bf16>(simd, rows, a_width, left);
+                pack_across::<S, O>(simd, rows, a_width, left);
             } else {
                 let rows = (first..first + count).map(|row| &a.values[row * inner..][inside.clone()]);
-                pack_rows::<S, Bf16>(simd, rows, a_width, left);
+                pack_rows::<S, O>(simd, rows, a_width, left);
             }
             let (row, step) = if a.transposed { (1, a_width) } else { (a_width, 1) };
             let panels = &packed[block * layout.num_panels * layout.panel_len()..];
             let right = Right { values: panels, step: layout.width, panel: layout.panel_len() };
             let left = Left { values: left, row, step };
             let accumulate = starts_filled || block > 0;
-            multiply::<S, Bf16>(simd, [count, lanes, columns], left, right, (result, whole), accumulate);
+            multiply::<S, O>(simd, [count, lanes, columns], left, right, (result, whole), accumulate);
         }
         if !in_place {
             for (to, row) in to.chunks_exact_mut(columns).zip(sums.chunks_exact(whole)) {

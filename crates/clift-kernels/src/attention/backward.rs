@@ -115,17 +115,17 @@ impl<'a> Kernel for BackwardTask<'a> {
         let Self { sizes, inputs, log_sum, grad_query, grad_key, grad_value, scene, head, keys } = self;
         let [query, key, value, output, grad_output] = inputs;
         let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
-        let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
+        let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<S, O>(head_width));
         let block = num_keys.min(BACKWARD_KEYS);
-        let key_lanes = lanes_of::<O>(block);
+        let key_lanes = lanes_of::<S, O>(block);
         let score_row = block.next_multiple_of(panel) + ROW_PADDING;
         // Values of f32 have the same layout along as across.
         let only_pairs = |len: usize| if O::PER_LANE > 1 { len } else { 0 };
         let lens = [
             only_pairs(num_queries * inner),
             only_pairs(num_queries * inner),
-            lanes_of::<O>(num_queries) * width,
-            lanes_of::<O>(num_queries) * width,
+            lanes_of::<S, O>(num_queries) * width,
+            lanes_of::<S, O>(num_queries) * width,
             num_queries,
             block.next_multiple_of(panel) * inner,
             block.next_multiple_of(panel) * inner,
@@ -134,7 +134,7 @@ impl<'a> Kernel for BackwardTask<'a> {
             block * width,
             QUERY_BLOCK * score_row,
             QUERY_BLOCK * score_row,
-            only_pairs(lanes_of::<O>(QUERY_BLOCK) * score_row),
+            only_pairs(lanes_of::<S, O>(QUERY_BLOCK) * score_row),
         ];
         grad_query.resize(num_queries * width, 0.0);
         let rows_of =
@@ -179,7 +179,7 @@ impl<'a> Kernel for BackwardTask<'a> {
             value_sums.fill(0.0);
             for start in (0..num_queries).step_by(QUERY_BLOCK) {
                 let rows = QUERY_BLOCK.min(num_queries - start);
-                let first_lane = lanes_of::<O>(start) * width;
+                let first_lane = lanes_of::<S, O>(start) * width;
                 let size = [rows, inner, count];
                 let left = |values| Left { values, row: query_row, step: 1 };
                 let right = |values| Right { values, step: panel, panel: panel * inner };
@@ -189,7 +189,7 @@ impl<'a> Kernel for BackwardTask<'a> {
                 let of_rows = (&log_sum[start..start + rows], &delta[start..start + rows]);
                 let (pair, size) = ((&mut *weights, &mut *slopes), [score_row, padded::<S>(count)]);
                 score_gradients::<S, O>(simd, pair, size, sizes.exponent_scale(), of_rows);
-                let size = [count, lanes_of::<O>(rows), head_width];
+                let size = [count, lanes_of::<S, O>(rows), head_width];
                 let right = |values| Right { values, step: width, panel };
                 let (query, grad) = (&queries_across[first_lane..], &grads_across[first_lane..]);
                 let left = by_key::<S, O>(simd, weights, [rows, count, score_row], across);
@@ -197,10 +197,10 @@ impl<'a> Kernel for BackwardTask<'a> {
                 let left = by_key::<S, O>(simd, slopes, [rows, count, score_row], across);
                 multiply::<S, O>(simd, size, left, right(query), (key_sums, width), true);
                 for row in 0..rows {
-                    pack_in_place::<S, O>(simd, &mut slopes[row * score_row..][..count]);
+                    pack_in_place::<S, O>(simd, &mut slopes[row * score_row..][..score_row], count);
                 }
                 let left = Left { values: slopes, row: score_row, step: 1 };
-                let size = [rows, lanes_of::<O>(count), head_width];
+                let size = [rows, lanes_of::<S, O>(count), head_width];
                 let to = (&mut grad_query[start * width..], width);
                 let right = Right { values: key_panels, step: panel, panel: key_lanes * panel };
                 multiply::<S, O>(simd, size, left, right, to, true);
@@ -226,6 +226,7 @@ fn by_key<'v, S: Simd, O: Operands>(
     across: &'v mut [f32],
 ) -> Left<'v> {
     let values = if O::PER_LANE > 1 {
+        let across = &mut across[..lanes_of::<S, O>(rows) * stride];
         let rows = values.chunks(stride).take(rows).map(|row| &row[..count]);
         pack_across::<S, O>(simd, rows, stride, across);
         across

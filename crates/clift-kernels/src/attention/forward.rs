@@ -72,9 +72,9 @@ impl<'a> Kernel for Forward<'a> {
     fn run<S: Simd, O: Operands>(self, simd: S) {
         let Self { sizes, inputs: [query, key, value], output, log_sum, scene, head, queries } = self;
         let AttentionSizes { num_keys, head_width, .. } = sizes;
-        let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<O>(head_width));
+        let (width, panel, inner) = (padded::<S>(head_width), panel_width::<S>(), lanes_of::<S, O>(head_width));
         let score_row = num_keys.min(FORWARD_KEYS).next_multiple_of(panel) + ROW_PADDING;
-        let key_lanes = lanes_of::<O>(num_keys);
+        let key_lanes = lanes_of::<S, O>(num_keys);
         let lens = [
             num_keys.next_multiple_of(panel) * inner,
             key_lanes * width.next_multiple_of(panel),
@@ -102,18 +102,19 @@ impl<'a> Kernel for Forward<'a> {
                 let right = Right { values: &keys[first_key * inner..], step: panel, panel: panel * inner };
                 multiply::<S, O>(simd, [rows, inner, count], left, right, (scores, score_row), false);
                 for row in 0..rows {
-                    let scores = &mut scores[row * score_row..][..count];
+                    let scores = &mut scores[row * score_row..][..score_row];
                     let factor = sizes.exponent_scale();
-                    let shrink = exponentials::<S, O>(simd, scores, factor, &mut highest[row], &mut total[row]);
-                    pack_in_place::<S, O>(simd, scores);
+                    let shrink =
+                        exponentials::<S, O>(simd, &mut scores[..count], factor, &mut highest[row], &mut total[row]);
+                    pack_in_place::<S, O>(simd, scores, count);
                     if shrink != 1.0 {
                         scale(simd, &mut sums[row * width..][..width], shrink);
                     }
                 }
                 let left = Left { values: scores, row: score_row, step: 1 };
-                let values = &values[lanes_of::<O>(first_key) * panel..];
+                let values = &values[lanes_of::<S, O>(first_key) * panel..];
                 let right = Right { values, step: panel, panel: key_lanes * panel };
-                multiply::<S, O>(simd, [rows, lanes_of::<O>(count), head_width], left, right, (sums, width), true);
+                multiply::<S, O>(simd, [rows, lanes_of::<S, O>(count), head_width], left, right, (sums, width), true);
             }
             for row in 0..rows {
                 let result = sums[row * width..][..head_width].iter().map(|sum| sum / total[row]);

@@ -1,10 +1,17 @@
 //! Operands of matrix products, laid out for the register tile.
 
-use crate::simd::vector::{MAX_LANES, Operands, Simd};
+use crate::simd::vector::{MATRIX_LANES, MAX_LANES, Operands, Simd};
 
-/// Returns the lanes that `count` values along the inner dimension take.
-pub(crate) fn lanes_of<O: Operands>(count: usize) -> usize {
-    count.div_ceil(O::PER_LANE)
+/// Whether [`multiply`](crate::primitives::matmul::multiply) runs matrix tiles.
+#[inline(always)]
+pub(crate) fn has_matrix_tiles<S: Simd, O: Operands>() -> bool {
+    S::HAS_MATRIX_TILES && O::PER_LANE == 2
+}
+
+/// Returns the lanes that `count` values along the inner dimension take, with the zeros at their end.
+#[inline(always)]
+pub(crate) fn lanes_of<S: Simd, O: Operands>(count: usize) -> usize {
+    count.div_ceil(O::PER_LANE).next_multiple_of(if has_matrix_tiles::<S, O>() { MATRIX_LANES } else { 1 })
 }
 
 /// Packs rows along the inner dimension, one after the other: `to[row][lane]` with `width` lanes a row, zeros at the end.
@@ -22,13 +29,13 @@ pub(crate) fn pack_rows<'a, S: Simd, O: Operands>(
     }
 }
 
-/// Packs a row along the inner dimension in its own place, the lanes at the start.
+/// Packs the first `count` values of a row along the inner dimension in their own place, the lanes at the start.
 #[inline(always)]
-pub(crate) fn pack_in_place<S: Simd, O: Operands>(simd: S, row: &mut [f32]) {
+pub(crate) fn pack_in_place<S: Simd, O: Operands>(simd: S, row: &mut [f32], count: usize) {
     if O::PER_LANE > 1 {
-        for start in (0..lanes_of::<O>(row.len())).step_by(S::LANES) {
+        for start in (0..lanes_of::<S, O>(count)).step_by(S::LANES) {
             // Written where the values are read already.
-            let packed = O::along(simd, row, start);
+            let packed = O::along(simd, &row[..count], start);
             simd.write(&mut row[start..], packed);
         }
     }
@@ -43,7 +50,7 @@ pub(crate) fn pack_across<'a, S: Simd, O: Operands>(
     to: &mut [f32],
 ) {
     for to in to.chunks_exact_mut(width) {
-        let Some(first) = rows.next() else { break };
+        let first = rows.next().unwrap_or_default();
         let second = if O::PER_LANE == 2 { rows.next().unwrap_or_default() } else { &[] };
         for (i, to) in to.chunks_mut(S::LANES).enumerate() {
             simd.write(to, O::across(simd, [first, second], i * S::LANES));

@@ -1,17 +1,21 @@
-//! AVX-512 vectors, with and without bf16.
+//! AVX-512 vectors, with and without bf16 and AMX.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx512` proves that the processor has AVX-512")]
 
-use crate::simd::vector::{Simd, binary_intrinsics, emulated_dot_pairs, emulated_pairs, emulated_pairs_of_neighbours};
+use crate::simd::amx;
+use crate::simd::vector::{
+    MAX_LANES, Simd, Tile, binary_intrinsics, emulated_dot_pairs, emulated_pairs, emulated_pairs_of_neighbours,
+};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
 
 /// AVX-512: 16 lanes, 32 registers.
 #[derive(Clone, Copy, Debug)]
-pub struct Avx512<const BF16: bool>(());
+pub struct Avx512<const BF16: bool, const AMX: bool>(());
 
-impl<const BF16: bool> Avx512<BF16> {
-    /// Creates the proof that the processor has AVX-512 F, VL, BW and DQ, and BF16 if `BF16`.
+impl<const BF16: bool, const AMX: bool> Avx512<BF16, AMX> {
+    /// Creates the proof that the processor has AVX-512 F, VL, BW and DQ, BF16 if `BF16`, and that the tiles
+    /// of this thread are configured if `AMX`.
     pub unsafe fn new() -> Self {
         Self(())
     }
@@ -29,10 +33,11 @@ const ALTERNATING: [i16; 32] = {
     order
 };
 
-impl<const BF16: bool> Simd for Avx512<BF16> {
+impl<const BF16: bool, const AMX: bool> Simd for Avx512<BF16, AMX> {
     const LANES: usize = 16;
     const TILE_ROWS: usize = 12;
     const TILE_VECTORS: usize = 2;
+    const HAS_MATRIX_TILES: bool = AMX;
     type V = __m512;
 
     #[inline(always)]
@@ -107,4 +112,37 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
             _mm512_dpbf16_ps(sum, a, std::mem::transmute::<__m512, __m512bh>(b))
         }
     }
+    #[inline(always)]
+    unsafe fn multiply_tile(self, tile: Tile, vectors: usize) {
+        assert!(AMX, "only with matrix tiles");
+        unsafe { amx::multiply_tile(tile, vectors) };
+    }
+    #[inline(always)]
+    fn transpose(self, rows: &mut [__m512; MAX_LANES]) {
+        const ORDERS: [[[i32; 16]; 2]; 4] =
+            [exchanged_lanes(1), exchanged_lanes(2), exchanged_lanes(4), exchanged_lanes(8)];
+        for (bit, orders) in ORDERS.iter().enumerate() {
+            let [low, high] = [0, 1].map(|i| unsafe { _mm512_loadu_epi32(orders[i].as_ptr()) });
+            let step = 1 << bit;
+            for row in (0..16).filter(|row| row & step == 0) {
+                let (a, b) = (rows[row], rows[row + step]);
+                rows[row] = unsafe { _mm512_permutex2var_ps(a, low, b) };
+                rows[row + step] = unsafe { _mm512_permutex2var_ps(a, high, b) };
+            }
+        }
+    }
+}
+
+/// Lanes of two rows after a step of a transposition, those of the second row from 16 on: the rows, `step` apart, exchange
+/// the lanes whose index differs from the row's in the bit `step`.
+const fn exchanged_lanes(step: usize) -> [[i32; 16]; 2] {
+    let mut orders = [[0; 16]; 2];
+    let mut lane = 0;
+    while lane < 16 {
+        let other = (lane ^ step) as i32;
+        orders[0][lane] = if lane & step == 0 { lane as i32 } else { 16 + other };
+        orders[1][lane] = if lane & step == 0 { other } else { 16 + lane as i32 };
+        lane += 1;
+    }
+    orders
 }

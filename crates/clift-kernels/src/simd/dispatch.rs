@@ -6,6 +6,8 @@ use crate::simd::portable::Portable;
 use crate::simd::vector::{Bf16, F32, Operands, Simd};
 
 #[cfg(target_arch = "x86_64")]
+use crate::simd::amx::{self, Tiles};
+#[cfg(target_arch = "x86_64")]
 use crate::simd::{avx2::Avx2, avx512::Avx512};
 
 /// Instructions that a kernel is compiled for. [`InstructionSet::available`] lists those that the processor runs.
@@ -19,6 +21,8 @@ pub enum InstructionSet {
     Avx512,
     /// The same and AVX-512 BF16.
     Avx512Bf16,
+    /// The same and AMX for products of bf16 values, on Linux.
+    Amx,
 }
 
 /// Type of the operands of matrix products; sums are f32.
@@ -45,7 +49,9 @@ impl InstructionSet {
 
     /// Iterates over the sets that this processor runs, widest first.
     pub fn available() -> impl Iterator<Item = Self> {
-        [Self::Avx512Bf16, Self::Avx512, Self::Avx2, Self::Portable].into_iter().filter(|set| set.is_available())
+        [Self::Amx, Self::Avx512Bf16, Self::Avx512, Self::Avx2, Self::Portable]
+            .into_iter()
+            .filter(|set| set.is_available())
     }
 
     /// Returns the name in lower case.
@@ -55,6 +61,7 @@ impl InstructionSet {
             Self::Avx2 => "avx2",
             Self::Avx512 => "avx512",
             Self::Avx512Bf16 => "avx512-bf16",
+            Self::Amx => "amx",
         }
     }
 
@@ -68,11 +75,16 @@ impl InstructionSet {
                 && is_x86_feature_detected!("avx512dq")
                 && avx2()
         };
+        let bf16 = || is_x86_feature_detected!("avx512bf16") && avx512();
         match self {
             Self::Portable => true,
             Self::Avx2 => avx2(),
             Self::Avx512 => avx512(),
-            Self::Avx512Bf16 => is_x86_feature_detected!("avx512bf16") && avx512(),
+            Self::Avx512Bf16 => bf16(),
+            Self::Amx => {
+                static HAS_TILES: OnceLock<bool> = OnceLock::new();
+                bf16() && *HAS_TILES.get_or_init(amx::is_available)
+            }
         }
     }
 
@@ -83,7 +95,7 @@ impl InstructionSet {
 
     /// Whether the set has instructions for products of bf16 values; the others emulate them, many times slower than f32.
     pub fn has_bf16(self) -> bool {
-        self == Self::Avx512Bf16
+        matches!(self, Self::Avx512Bf16 | Self::Amx)
     }
 
     /// Runs a kernel compiled for this instruction set, which the processor must have, on this thread.
@@ -111,9 +123,18 @@ impl InstructionSet {
             Self::Avx512 => unsafe { run_avx512::<O>(kernel) },
             // SAFETY: checked above.
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512Bf16 => unsafe { run_avx512_bf16::<O>(kernel) },
+            Self::Avx512Bf16 => unsafe { run_avx512_bf16::<false, O>(kernel) },
+            // SAFETY: checked above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Amx if O::PER_LANE == 1 => unsafe { run_avx512_bf16::<false, O>(kernel) },
+            // SAFETY: checked above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Amx => unsafe {
+                let _tiles = Tiles::configure();
+                run_avx512_bf16::<true, O>(kernel);
+            },
             #[cfg(not(target_arch = "x86_64"))]
-            Self::Avx2 | Self::Avx512 | Self::Avx512Bf16 => unreachable!("not available"),
+            Self::Avx2 | Self::Avx512 | Self::Avx512Bf16 | Self::Amx => unreachable!("not available"),
         }
     }
 }
@@ -129,12 +150,12 @@ fn run_avx2<O: Operands>(kernel: impl Kernel) {
 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
 fn run_avx512<O: Operands>(kernel: impl Kernel) {
     // SAFETY: this function is only called on a processor with these instructions.
-    kernel.run::<_, O>(unsafe { Avx512::<false>::new() });
+    kernel.run::<_, O>(unsafe { Avx512::<false, false>::new() });
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512bf16,avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
-fn run_avx512_bf16<O: Operands>(kernel: impl Kernel) {
-    // SAFETY: this function is only called on a processor with these instructions.
-    kernel.run::<_, O>(unsafe { Avx512::<true>::new() });
+fn run_avx512_bf16<const AMX: bool, O: Operands>(kernel: impl Kernel) {
+    // SAFETY: this function is only called on a processor with these instructions, with `AMX` after the tiles were configured.
+    kernel.run::<_, O>(unsafe { Avx512::<true, AMX>::new() });
 }

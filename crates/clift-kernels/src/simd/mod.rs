@@ -4,9 +4,12 @@
 //! - `portable`: vectors in plain Rust
 //! - `avx2`: AVX2 and FMA
 //! - `avx512`: AVX-512, with and without bf16
+//! - `amx`: products of tiles of bf16 values
 //! - `peak`: the most that the processor computes
 //! - `dispatch`: the choice of the instruction set, and running a kernel with it
 
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod amx;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]

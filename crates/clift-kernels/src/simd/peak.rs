@@ -3,8 +3,9 @@
 use std::hint::black_box;
 use std::time::Instant;
 
+use crate::primitives::packing::has_matrix_tiles;
 use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
-use crate::simd::vector::{Operands, Simd};
+use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile};
 
 /// Independent sums, enough to hide the latency of a multiply-add.
 const SUMS: usize = 12;
@@ -29,6 +30,10 @@ struct Rounds<'a>(&'a mut f64);
 impl Kernel for Rounds<'_> {
     #[inline(always)]
     fn run<S: Simd, O: Operands>(self, simd: S) {
+        if has_matrix_tiles::<S, O>() {
+            *self.0 = matrix_rounds(simd);
+            return;
+        }
         let (a, b) = (black_box(simd.splat(1.0)), black_box(simd.splat(0.5)));
         let mut sums = [simd.splat(0.0); SUMS];
         for _ in 0..ROUNDS {
@@ -39,4 +44,21 @@ impl Kernel for Rounds<'_> {
         black_box(sums);
         *self.0 = (2 * ROUNDS * SUMS * S::LANES * O::PER_LANE) as f64;
     }
+}
+
+/// Multiplies tiles whose operands stay in the L1 cache; returns the number of operations.
+#[inline(always)]
+fn matrix_rounds<S: Simd>(simd: S) -> f64 {
+    const INNER: usize = 4 * MATRIX_LANES;
+    let (a, mut c) = (vec![0.0; MATRIX_ROWS * INNER], vec![0.0; MATRIX_ROWS * MATRIX_ROWS]);
+    let (rows, accumulate) = (MATRIX_ROWS, true);
+    for _ in 0..ROUNDS / INNER {
+        let (a, c) = (black_box(a.as_ptr()), c.as_mut_ptr());
+        // B has the size of A.
+        let tile = Tile { inner: INNER, a, a_row: INNER, a_step: 1, b: a, b_step: rows, c, c_row: rows, accumulate };
+        // SAFETY: both slices have the sizes of the tile.
+        unsafe { simd.multiply_tile(tile, S::TILE_VECTORS) };
+    }
+    black_box(c);
+    (ROUNDS / INNER * 2 * 2 * MATRIX_ROWS * MATRIX_ROWS * INNER) as f64
 }

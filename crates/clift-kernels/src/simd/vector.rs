@@ -13,6 +13,8 @@ pub trait Simd: Copy + Send + Sync + 'static {
     const TILE_ROWS: usize;
     /// Vectors side by side in the register tile of a matrix product.
     const TILE_VECTORS: usize;
+    /// Whether products of bf16 values are computed by [`Simd::multiply_tile`].
+    const HAS_MATRIX_TILES: bool = false;
     type V: Copy;
 
     fn splat(self, value: f32) -> Self::V;
@@ -58,6 +60,22 @@ pub trait Simd: Copy + Send + Sync + 'static {
         emulated_dot_pairs(self, a, b, sum)
     }
 
+    /// Runs a tile of pairs with [`MATRIX_ROWS`] rows and as many columns, as [`Tile::run`]. The inner dimension is a multiple
+    /// of [`MATRIX_LANES`], the step of A is 1. With one vector B has 16 columns only, and the others of C are undefined.
+    ///
+    /// # Safety
+    /// That of [`Tile::run`].
+    #[inline(always)]
+    unsafe fn multiply_tile(self, _tile: Tile, _vectors: usize) {
+        unreachable!("only with matrix tiles");
+    }
+
+    /// Transposes a matrix of [`Simd::LANES`] vectors. Only with matrix tiles.
+    #[inline(always)]
+    fn transpose(self, _rows: &mut [Self::V; MAX_LANES]) {
+        unreachable!("only with matrix tiles");
+    }
+
     /// Reads a vector from the start of a slice; missing values are zero.
     #[inline(always)]
     fn read(self, from: &[f32]) -> Self::V {
@@ -101,6 +119,10 @@ fn exp2_by<S: Simd, const COUNT: usize>(simd: S, a: S::V, coefficients: [f32; CO
 }
 
 pub(crate) const MAX_LANES: usize = 16;
+/// Rows and columns of a matrix tile.
+pub(crate) const MATRIX_ROWS: usize = 32;
+/// The inner dimension of a matrix tile is a multiple of this number of lanes.
+pub(crate) const MATRIX_LANES: usize = 16;
 
 // Without instructions for bf16: slow, references for tests.
 
