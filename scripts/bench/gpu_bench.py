@@ -1,8 +1,8 @@
 """The sweep of a GPU: clift's kernels and whole updates beside PyTorch, within a few minutes. gpu_bench.sh packs and runs it.
 
-Four parts: `clift doctor`; every candidate tile of the products and attentions (crates/clift-cube/examples/sweep); updates,
+Five parts: `clift doctor`; every candidate tile of the products and attentions (crates/clift-cube/examples/sweep); updates,
 encoding and rendering of the paper's network beside PyTorch (the twin in clift_torch.py, with fused attention and AdamW);
-steps of configs/re10k.toml. Every measurement is a process of its own with a time limit, and is in the JSON file as soon
+the time of every kernel in them (`clift bench --ledger`); steps of configs/re10k.toml. Every measurement is a process of its own with a time limit, and is in the JSON file as soon
 as it ends (candidates: as soon as each ends). The time that a part leaves is for the next ones. `clift` compiles kernels to
 WGSL, without cooperative matrices; `clift-spirv`, if packed, to SPIR-V, with them.
 
@@ -32,7 +32,7 @@ from bench_rows import FULL, SMOKE, overrides
 HERE = Path(__file__).resolve().parent
 PACKED = HERE.parent
 # Parts, and the share of the time at which each ends at the latest.
-PARTS = {"doctor": 0.12, "kernels": 0.5, "updates": 0.8, "train": 0.97}
+PARTS = {"doctor": 0.12, "kernels": 0.45, "updates": 0.75, "ledger": 0.83, "train": 0.97}
 # Repeats of every work. The first half warms up: a GPU raises its clocks only under load.
 WORKS = {"stage1_step": 10, "stage2_step": 14, "encode": 120, "render": 120}
 # A candidate that takes longer is stopped. The first update of a process compiles all kernels.
@@ -239,6 +239,19 @@ class Sweep:
             raise Failed(f"clift measured {written['device']} in {written['precision']}")
         return written["rows"][0]["samples_s"]
 
+    def ledger(self, end: float) -> None:
+        """The kernels of every work, by the first binary."""
+        name, clift = next(self.binaries())
+        path = self.folder / "ledger.json"
+        command = [clift, "bench", PACKED / "sizes.toml", "--ledger", "--case", ",".join(WORKS), "--stored-tokens", "1/4"]
+        command += ["--json", path, "--force", "--device", self.args.device]
+        try:
+            run([*command, *sets(*overrides(self.size), f'precision="{PRECISION[name]}"')], self.left(end))
+            self.report["ledger"] = json.loads(path.read_text())
+        except Failed as error:
+            self.fail("ledger", error)
+        self.save()
+
     def train(self, end: float) -> None:
         """Steps of re10k.toml with one micro-batch of four scenes each, by the first binary whose updates work."""
         clifts = [(f"clift {compiler} {PRECISION[compiler]}", compiler, path) for compiler, path in self.binaries()]
@@ -359,6 +372,21 @@ def update_table(rows: list[Values]) -> str:
     return table(["work: median (first)", *sides], lines)
 
 
+def ledger_table(ledger: Values) -> str:
+    """The kernels of every work that take the most time."""
+    lines = []
+    for row in ledger["rows"]:
+        kernels = sorted(row["kernels"], key=lambda kernel: -(kernel["seconds"] or 0))
+        for kernel in kernels[:8]:
+            time_s, size = kernel["seconds"], kernel["bytes"]
+            cells = [seconds(time_s) if time_s else "-", f"{size / 1e9:.3g}" if size else "-"]
+            lines.append([row["case"], kernel["kernel"], str(kernel["count"]), *cells])
+        total = sum(kernel["count"] for kernel in row["kernels"])
+        held = row["reserved_bytes"] or 0
+        lines.append([row["case"], "all", str(total), f"{held / 2**30:.2f} GiB held", ""])
+    return table(["work", "kernel", "launches", "time", "GB"], lines)
+
+
 def train_text(row: Values) -> str:
     if "step_s" not in row:
         return f"{row['clift']}, {row['data']}: no step was done"
@@ -382,6 +410,8 @@ def summary(report: Values) -> str:
         parts.append(kernel_table(report["kernels"]))
     if report.get("updates"):
         parts.append(update_table(report["updates"]))
+    if "ledger" in report:
+        parts.append(ledger_table(report["ledger"]))
     if "train" in report:
         parts.append(train_text(report["train"]))
     return "\n\n".join(parts)

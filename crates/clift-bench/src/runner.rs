@@ -60,12 +60,8 @@ pub fn run_bench(
     report: &mut dyn FnMut(&BenchRow),
 ) -> Result<BenchReport, TrainError> {
     let context = BenchContext::new(config, options)?;
-    let is_measured = |case: &BenchCase| {
-        options.cases.contains(case) && (config.model.architecture.supports_clusters() || !case.needs_clusters())
-    };
-    let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(is_measured).collect();
-    let mut rows = Vec::with_capacity(cases.len());
-    for case in cases {
+    let mut rows = Vec::new();
+    for case in context.cases() {
         let row = measure(case, &context, options, stop)?;
         report(&row);
         rows.push(row);
@@ -75,7 +71,7 @@ pub fn run_bench(
 }
 
 /// Makes networks and inputs of a case, so that only its computation is left to be timed.
-fn prepare(case: BenchCase, context: &BenchContext) -> Result<Box<dyn BenchTask>, TrainError> {
+pub(crate) fn prepare(case: BenchCase, context: &BenchContext) -> Result<Box<dyn BenchTask>, TrainError> {
     Ok(match case {
         BenchCase::Encode => Box::new(forward::encode(context)?),
         BenchCase::Kmeans => Box::new(KMeansCase::new(context)?),

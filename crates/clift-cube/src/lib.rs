@@ -8,6 +8,7 @@
 //! - `rows`: layer norm, RMS norm, GELU
 //! - `products`: products in f32 registers or cooperative matrices, and the table of their tiles
 //! - `attention`: attention, attention inside clusters, transforms of heads by cameras
+//! - `ledger`: the kernels that a computation launches
 //!
 //! `examples/sweep` times candidate tiles.
 #![cfg(feature = "wgpu")]
@@ -24,6 +25,7 @@
 mod adapter;
 mod attention;
 mod buffers;
+mod ledger;
 mod products;
 mod rows;
 #[cfg(test)]
@@ -39,6 +41,7 @@ pub use buffers::adamw::{AdamW, adamw, gradient_norm};
 pub use buffers::buffer::{Buffer, Matrices, Values};
 pub use buffers::elementwise::cast;
 pub use buffers::reduce::sum_rows;
+pub use ledger::{Launch, Observation, observe, reserved_bytes};
 pub use products::convolution::{KERNEL_LEN, convolve};
 pub use products::matrix_product::MatrixTile;
 pub use products::product::Product;

@@ -54,6 +54,7 @@ pub use names::{parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
 pub use device::adapter::{ADAPTER_VARIABLE, Adapter, adapters, max_tensor_bytes, product_instructions, used_adapter};
+pub use device::ledger::{KernelLaunches, observe_kernels, reserved_bytes};
 pub use device::name::DeviceName;
 pub use ops::precision::Precision;
 // Images and cameras

@@ -14,8 +14,8 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use burn::tensor::{DType, Device, Tensor};
-use clift_bench::{BenchCase, BenchOptions, CaseSize, run_bench, run_stability, stability_markdown};
-use clift_model::{DeviceName, Precision, TokenCount, adapters, max_tensor_bytes};
+use clift_bench::{BenchCase, BenchOptions, CaseSize, run_bench, run_ledger, run_stability, stability_markdown};
+use clift_model::{DeviceName, Precision, TokenCount, adapters, max_tensor_bytes, observe_kernels};
 use clift_scene::Scene;
 use clift_train::{Config, read_config};
 
@@ -87,6 +87,32 @@ fn every_part_of_the_method_is_close_to_f64() {
             assert!(row.max_rel_error.is_some_and(|error| error < 1e-4), "{set:?}: {row:?}");
         }
     }
+}
+
+/// The launches of an update do not depend on sizes, only on the number of blocks: 6 + 6 in the paper.
+#[test]
+fn updates_launch_few_kernels_and_only_own_products() {
+    let Some((device, _guard)) = gpu() else { return };
+    let (values, kernels) = observe_kernels(true, || (Tensor::<1>::ones([300], &device) * 2.0).into_data());
+    assert_eq!(values.as_slice::<f32>().expect("f32"), [2.0; 300], "timed kernels run");
+    let measured = kernels.iter().filter_map(|kernel| kernel.seconds);
+    assert!(kernels.iter().any(|kernel| kernel.count == 1) && measured.fold(0.0, f64::max) < 60.0, "{kernels:?}");
+
+    let set = ["device='wgpu'", "model.num_encoder_blocks=6", "model.num_renderer_blocks=6"];
+    let cases = vec![BenchCase::Encode, BenchCase::Stage1Step];
+    let stored_tokens = TokenCount::Count(3);
+    let options = BenchOptions { cases, repeats: 1, warmup: 1, error: false, stored_tokens };
+    let ledger = run_ledger(&config(&set), &options, &AtomicBool::new(false), &mut |_| ()).expect("runs");
+    for row in &ledger.rows {
+        let kernels = row.kernels.iter().map(|kernel| (&*kernel.kernel, kernel.count, kernel.bytes));
+        let of_burn: Vec<_> = kernels.clone().filter(|(name, ..)| name.starts_with("burn")).collect();
+        println!("{}: {} launches, {} bytes; {of_burn:?}", row.case, row.count(), row.bytes());
+        let products = of_burn.iter().filter(|(name, ..)| name.contains("matmul") || name.contains("attention"));
+        assert_eq!(products.count(), 0, "{of_burn:?}");
+        assert!(kernels.clone().any(|(name, _, bytes)| name.starts_with("attention") && bytes > Some(0)));
+    }
+    let [encode, update] = [0, 1].map(|i| ledger.rows[i].count());
+    assert!((60..300).contains(&encode) && (600..=1200).contains(&update), "{encode}, {update}");
 }
 
 #[test]

@@ -59,6 +59,14 @@ impl BenchContext {
         Ok(context)
     }
 
+    /// Returns the cases of the options that the network has, in order.
+    pub fn cases(&self) -> Vec<BenchCase> {
+        let has_clusters = self.config.model.architecture.supports_clusters();
+        let is_measured =
+            |case: &BenchCase| self.options.cases.contains(case) && (has_clusters || !case.needs_clusters());
+        BenchCase::ALL.iter().copied().filter(is_measured).collect()
+    }
+
     /// Returns the same network on at most [`MAX_CHECKED_TOKENS`] tokens: smaller images, then fewer scenes and views.
     pub fn reduced(&self) -> Result<Self, TrainError> {
         let mut config = self.config.clone();

@@ -4,6 +4,8 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use cubecl::server::Handle;
 
+use crate::ledger::count_argument;
+
 /// Type of the values of a buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Values {
@@ -48,6 +50,7 @@ impl Buffer {
 
     /// Returns the buffer as an argument of vectors of `width` values.
     pub(crate) fn arg(&self, width: usize) -> BufferArg {
+        count_argument(self.len * self.values.bytes());
         // SAFETY: the buffer has `len` values.
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len / width) }
     }

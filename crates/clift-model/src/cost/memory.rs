@@ -7,7 +7,6 @@ use crate::cost::scene_sizes::SceneSizes;
 use crate::network::blocks::feed_forward::Activation;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Rows, TARGETS_AND_TOKENS};
-use crate::ops::precision::Precision;
 
 const F32: f64 = 4.0;
 /// Bytes of the C library's heap per byte that a backward pass keeps: the heap holds on to freed pieces below 32 MiB.
@@ -54,8 +53,9 @@ pub struct UpdateSizes {
     pub num_scenes: usize,
     /// Whether the gradients of several micro-batches are summed.
     pub is_accumulated: bool,
-    /// Precision of matrix products. In bf16 attention saves its inputs in bf16, a feed-forward network the input of its GELU.
-    pub precision: Precision,
+    /// Whether attention saves its inputs, and a feed-forward network the input of its GELU, in 16 bits: in bf16, and in f16 on
+    /// GPUs with matrix instructions.
+    pub saves_half: bool,
     /// Moments per value of a block's weight matrices: two with `AdamW`, one with Muon.
     pub matrix_moments: usize,
     /// Sizes of one scene.
@@ -123,13 +123,13 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
 /// Returns the segment of one block, or of consecutive layers outside the blocks. The kept values follow from the layers;
 /// the additional ones from a formula per kind of block, which agrees with measured peaks.
 fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_trained: bool) -> Segment {
-    let UpdateSizes { scene, precision, .. } = sizes;
+    let UpdateSizes { scene, saves_half, .. } = sizes;
     let first = &layers[0];
     let values = |count: u64, width: usize| (count * width as u64) as f64;
     let x = values(scene.num_rows(first.rows), config.dim);
     let (mut saved, mut head_norms, mut hidden) = (0.0, 0.0, 0.0);
-    // Saved in bf16, and the most of them that the backward has in f32 at once.
-    let (mut in_bf16, mut restored) = (0.0, 0.0_f64);
+    // Saved in 16 bits, and the most of them that the backward has in f32 at once.
+    let (mut in_half, mut restored) = (0.0, 0.0_f64);
     // For keys and values of other rows: needed in the backward, and in the forward.
     let (mut cross_working, mut cross_forward) = (0.0, 0.0);
     for layer in layers {
@@ -165,8 +165,8 @@ fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_train
             LayerKind::Activation { activation, .. } => activation == Activation::Gelu,
             _ => false,
         };
-        if *precision == Precision::Bf16 && is_rounded {
-            (in_bf16, restored) = (in_bf16 + input, restored.max(input));
+        if *saves_half && is_rounded {
+            (in_half, restored) = (in_half + input, restored.max(input));
         }
     }
     let parameters = layers.iter().map(Layer::num_parameters).sum::<u64>() as f64;
@@ -174,7 +174,7 @@ fn segment(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes, is_train
     match first.block {
         Some(_) if !is_trained => Segment { forward: forward_values(config, x) + x, ..Segment::default() },
         Some(_) => {
-            let kept = saved + head_norms - in_bf16 / 2.0;
+            let kept = saved + head_norms - in_half / 2.0;
             // Gradients of the residual stream and of the hidden values, and the recomputed norm.
             let working = (2.0 * x + hidden).max(cross_working - hidden) + restored;
             let forward = saved + hidden + cross_forward;
@@ -274,16 +274,14 @@ mod tests {
         let config = ModelConfig::default();
         let scene = SceneSizes::new(4096, 1, 1024);
         let stored = SceneSizes { num_storage_tokens: Some(1024), num_render_tokens: 1024, ..scene };
-        for (trained, precision, scene, measured) in [
-            (STAGE1, Precision::F32, scene, 2.26e9),
-            (STAGE1, Precision::Bf16, scene, 2.03e9),
-            (STAGE2, Precision::F32, stored, 1.43e9),
-        ] {
+        for (trained, saves_half, scene, measured) in
+            [(STAGE1, false, scene, 2.26e9), (STAGE1, true, scene, 2.03e9), (STAGE2, false, stored, 1.43e9)]
+        {
             let one = UpdateSizes {
                 trained,
                 num_scenes: 1,
                 is_accumulated: false,
-                precision,
+                saves_half,
                 matrix_moments: 2,
                 scene,
                 num_image_values: 5 * 256 * 256 * 3,

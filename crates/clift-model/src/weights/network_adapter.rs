@@ -110,7 +110,7 @@ impl NetworkAdapter {
         let has = |part: &str| name.contains(part);
         // Queries, keys and values lie side by side.
         let num_thirds = if has("in_proj") { 3 } else { 1 + usize::from(has("kv_proj")) };
-        let is_row = name.ends_with(".bias") || has("norm");
+        let is_row = layer.shape[0] == 1;
         let [added, added_hidden] = [new_dim - dim, new_hidden - hidden];
         let added_rows = match () {
             () if is_row || has("_embed") => 0,
@@ -128,7 +128,7 @@ impl NetworkAdapter {
         let reads = ["in_proj", "q_proj", "kv_proj", ".up.", "to_pixels"].into_iter().any(has);
         let squares: f32 = layer.values.iter().map(|value| value * value).sum();
         let deviation = if reads && !is_row { (squares / layer.values.len() as f32).sqrt() } else { 0.0 };
-        let scale = if has("norm") && name.ends_with(".weight") { (dim as f32 / new_dim as f32).sqrt() } else { 1.0 };
+        let scale = if has("norm") && !has("bias") { (dim as f32 / new_dim as f32).sqrt() } else { 1.0 };
         Layer::new([rows, columns], |row, column| {
             let place = column % third;
             if row < layer.shape[0] && place < former_third {

@@ -2,8 +2,8 @@
 
 use clift_eval::{EvalConfig, Method};
 use clift_model::{
-    InferenceSizes, LPIPS_MIN_SIZE_PX, Parameters, SceneSizes, Segment, UpdateSizes, VggShape, inference_bytes,
-    update_bytes,
+    DeviceName, InferenceSizes, LPIPS_MIN_SIZE_PX, Parameters, Precision, SceneSizes, Segment, UpdateSizes, VggShape,
+    inference_bytes, update_bytes,
 };
 
 use crate::config::config::{Algorithm, Config};
@@ -67,7 +67,12 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         trained: stage.trained(),
         num_scenes,
         is_accumulated: num_scenes < settings.batch_size,
-        precision: config.precision,
+        // A GPU without matrix instructions computes f16 in f32.
+        saves_half: match config.precision {
+            Precision::F32 => false,
+            Precision::Bf16 => true,
+            Precision::F16 => config.device == DeviceName::Wgpu,
+        },
         matrix_moments: if settings.optimizer.algorithm == Algorithm::Muon { 1 } else { 2 },
         scene: largest_scene(config, stage)?,
         num_image_values,

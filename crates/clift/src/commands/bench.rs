@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{BenchCase, BenchOptions, BenchReport, BenchRow, MAX_CHECKED_TOKENS, run_bench};
+use clift_bench::{BenchCase, BenchOptions, BenchReport, BenchRow, Ledger, MAX_CHECKED_TOKENS, run_bench, run_ledger};
 use clift_eval::table;
 use clift_model::{Precision, TokenCount};
 
@@ -23,6 +23,13 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         stored_tokens: args.stored_tokens,
     };
     let stop = interrupt::flag(Ending::WITHOUT_RESULTS)?;
+    if args.ledger {
+        let ledger = run_ledger(&config, &options, &stop, &mut |row| {
+            print_note(&format!("{}: {} launches", row.case, row.count()));
+        })?;
+        print_result(&ledger_text(&ledger))?;
+        return json.write(&ledger);
+    }
     let report = run_bench(&config, &options, &stop, &mut |row| {
         print_note(&format!("{}: {}", row.case, seconds(row.median_s)));
     })?;
@@ -69,6 +76,24 @@ fn cells(row: &BenchRow) -> [String; 5] {
     [row.case.to_string(), seconds(row.median_s), seconds(row.p95_s), memory, error]
 }
 
+fn ledger_text(ledger: &Ledger) -> String {
+    let Ledger { adapter, precision, is_timed, rows } = ledger;
+    let run = if *is_timed { "" } else { "; compiled, not run" };
+    let time = |value: Option<f64>| value.map_or_else(|| "-".into(), seconds);
+    let tables = rows.iter().map(|row| {
+        let total = ["all".into(), row.count().to_string(), memory_size(row.bytes()), time(row.seconds())];
+        let cells = row.kernels.iter().map(|kernel| {
+            let bytes = kernel.bytes.map_or_else(|| "-".into(), memory_size);
+            [kernel.kernel.clone(), kernel.count.to_string(), bytes, time(kernel.seconds)]
+        });
+        let reserved = row.reserved_bytes.map_or_else(|| "unknown".into(), memory_size);
+        let header = ["kernel", "launches", "bytes", "time"];
+        format!("\n{} ({reserved} of memory held)\n\n{}", row.case, table(header, [total].into_iter().chain(cells)))
+    });
+    let title = format!("{adapter}, {precision} products{run}\nbytes of the buffers of all launches, without Burn's");
+    [title].into_iter().chain(tables).collect::<Vec<_>>().join("\n")
+}
+
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("Cases:\n  {}", BenchCase::names()))]
 pub struct BenchArgs {
@@ -93,6 +118,9 @@ pub struct BenchArgs {
     /// Skip the comparison with f64
     #[arg(long)]
     pub no_error: bool,
+    /// List the kernels that the cases launch on a GPU, with their time on the device (not on a software adapter)
+    #[arg(long, conflicts_with_all = ["repeats", "no_error"])]
+    pub ledger: bool,
 }
 
 #[cfg(test)]

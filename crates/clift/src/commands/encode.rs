@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use clift_data::{ClipReader, SceneSource, SceneSubset, Split};
-use clift_model::TokenCount;
+use clift_model::{Precision, TokenCount};
 use clift_scene::{
     ContextChoice, EncodeOptions, Scene, SceneError, SceneOptions, TokenCoding, check_output_path, encode_scene,
     find_scene, frame_positions,
@@ -74,6 +74,9 @@ pub struct EncodeArgs {
     /// in about fifteen times the time.
     #[arg(long, value_name = "STEPS", default_value_t = 0, hide_default_value = true)]
     pub refine: usize,
+    /// Operands of matrix products: f32, bf16 or f16 [default: bf16 if the CPU has its instructions, else f32]
+    #[arg(long, value_name = "PRECISION")]
+    pub precision: Option<Precision>,
     #[command(flatten)]
     pub overrides: ConfigArgs,
 }
@@ -131,7 +134,11 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let mut progress = |done: usize, total: usize| {
         counter.get_or_insert_with(|| Counter::new("groups fitted", total as u64)).set(done as u64);
     };
-    let written = encode_scene(&model_args.open()?, &reader, scene, &options, &mut progress)?;
+    let model = model_args.open()?;
+    let precision = args.precision.unwrap_or_else(|| Precision::for_images(&model.device));
+    precision.check("--precision", &model.device)?;
+    let _precision = precision.scope();
+    let written = encode_scene(&model, &reader, scene, &options, &mut progress)?;
     if args.refine > 0 && counter.is_none() {
         print_warning("--refine: the scene is one group of views, whose tokens are not fitted");
     }

@@ -1,0 +1,95 @@
+//! The kernels that a computation launches: how often, on how many bytes, for how long.
+
+use std::cell::Cell;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use cubecl::MemoryScope;
+use cubecl::client::Client;
+use cubecl::dry_run::DryRun;
+use cubecl::future::block_on;
+use cubecl::logging::{LaunchObservation, LaunchObserver, ProfileDuration, TimingMethod, TimingRequest};
+
+thread_local! {
+    /// Bytes of the arguments of this thread's next launch.
+    static ARGUMENTS: Cell<u64> = const { Cell::new(0) };
+}
+
+/// Counts the bytes of an argument of a kernel of this crate, for its launch.
+pub(crate) fn count_argument(bytes: usize) {
+    ARGUMENTS.set(ARGUMENTS.get() + bytes as u64);
+}
+
+/// How the launches of a computation are observed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Observation {
+    /// Each is timed on the device.
+    Timed,
+    /// Kernels are compiled and not run: all results are undefined.
+    DryRun,
+}
+
+/// A launch of a kernel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Launch {
+    /// Name of the kernel's type.
+    pub kernel: &'static str,
+    /// Bytes of the buffers that are its arguments, each once; 0 for kernels of other crates.
+    pub bytes: u64,
+    /// Time on the device; `None` without timestamps.
+    pub seconds: Option<f64>,
+}
+
+struct Observer {
+    launches: Mutex<Vec<(Launch, Option<ProfileDuration>)>>,
+    timing: TimingRequest,
+}
+
+impl Observer {
+    fn with<T>(&self, change: impl FnOnce(&mut Vec<(Launch, Option<ProfileDuration>)>) -> T) -> T {
+        change(&mut self.launches.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+impl LaunchObserver for Observer {
+    fn launched(&self, kernel: &'static str) {
+        let launch = Launch { kernel, bytes: ARGUMENTS.take(), seconds: None };
+        self.with(|launches| launches.push((launch, None)));
+    }
+
+    fn timing(&self) -> TimingRequest {
+        self.timing
+    }
+
+    fn profiled(&self, _kernel: &'static str, profile: ProfileDuration) {
+        self.with(|launches| {
+            if let Some((_, of_last)) = launches.last_mut() {
+                *of_last = Some(profile);
+            }
+        });
+    }
+}
+
+/// Runs a computation and returns its result and the kernels that it launches, in order. Launches of other threads are counted
+/// too.
+pub fn observe<T>(observation: Observation, run: impl FnOnce() -> T) -> (T, Vec<Launch>) {
+    let is_timed = observation == Observation::Timed;
+    let timing = if is_timed { TimingRequest::Deferred } else { TimingRequest::None };
+    let observer = Arc::new(Observer { launches: Mutex::default(), timing });
+    let dry_run = (!is_timed).then(DryRun::new);
+    ARGUMENTS.set(0);
+    let observing = LaunchObservation::new(Arc::<Observer>::clone(&observer));
+    let result = run();
+    drop(observing);
+    drop(dry_run);
+    let launches = observer.with(std::mem::take).into_iter().map(|(launch, profile)| {
+        let profile = profile.filter(|profile| profile.timing_method() == TimingMethod::Device);
+        let ticks = profile.and_then(|profile| block_on(profile.resolve()));
+        Launch { seconds: ticks.map(|ticks| ticks.duration().as_secs_f64()), ..launch }
+    });
+    (result, launches.collect())
+}
+
+/// Returns the bytes that the allocator holds on the device.
+pub fn reserved_bytes(client: &Client) -> u64 {
+    client.memory_report(MemoryScope::Device).usage().bytes_reserved
+}
