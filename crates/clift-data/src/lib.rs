@@ -64,7 +64,7 @@ pub use sampling::training_clips::TrainingClips;
 pub use sampling::view_sampler::{ViewSampler, Window};
 
 // Lenses, files of poses, and measures on poses.
-pub use geometry::lens::{Lens, Projection};
+pub use geometry::lens::Lens;
 pub use geometry::overlap::overlap;
 pub use geometry::path_spread::contexts_along_path;
 pub use geometry::pose_file::read_poses;

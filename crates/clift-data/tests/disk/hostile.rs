@@ -55,7 +55,6 @@ fn errors_of_transforms_json_are_named() {
         ("\"fl_x\": 28.0", "\"fl_x\": NaN", "number out of range"),
         ("\"w\": 32", "\"w\": 0", "w is 0, expected a number of pixels"),
         ("\"OPENCV\"", "\"EQUIRECTANGULAR\"", "camera_model is EQUIRECTANGULAR, expected one of OPENCV, PINHOLE, "),
-        ("\"OPENCV\"", "\"FOV\"", "expected omega of the FOV camera"),
         (
             "\"fl_x\"",
             "\"distortion_params\": [0.1], \"fl_x\"",

@@ -132,49 +132,36 @@ impl<'a> Frame<'a> {
             ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
         const FISHEYE: [&str; 5] =
             ["OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"];
-        const OTHERS: [&str; 5] =
-            ["FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE"];
+        const OTHERS: [&str; 2] = ["FULL_OPENCV", "THIN_PRISM_FISHEYE"];
         let given: String = self.value("camera_model")?.unwrap_or_else(|| "OPENCV".into());
         let mut model = given.to_ascii_uppercase();
         if self.value("is_fisheye")? == Some(true) && PERSPECTIVE.contains(&model.as_str()) {
             model = "OPENCV_FISHEYE".into();
         }
         let or_zero = Option::unwrap_or_default;
-        let mut radial = self.numbers(["k1", "k2", "k3", "k4", "k5", "k6"])?.map(or_zero);
-        let mut tangential = self.numbers(["p1", "p2"])?.map(or_zero);
-        // All distortion parameters of nerfstudio in one list, instead of the keys above.
+        let [k1, k2, k3, k4, k5, k6] = self.numbers(["k1", "k2", "k3", "k4", "k5", "k6"])?.map(or_zero);
+        let [p1, p2, sx, sy] = self.numbers(["p1", "p2", "sx1", "sy1"])?.map(or_zero);
+        // The distortion parameters of nerfstudio in one list, instead of the keys above.
         let list: Vec<f64> = self.value("distortion_params")?.unwrap_or_default();
-        let is_aria = OTHERS[3..].contains(&model.as_str());
-        match *list {
-            [k1, k2, k3, k4, p1, p2] if !is_aria => {
-                (radial, tangential) = ([k1, k2, k3, k4, 0.0, 0.0], [p1, p2]);
-            }
-            [k1, k2, k3, k4] if !is_aria => radial = [k1, k2, k3, k4, 0.0, 0.0],
-            _ if list.is_empty() != is_aria => {}
+        let (radial, tangential) = match *list {
+            [] => ([k1, k2, k3, k4], [p1, p2]),
+            [k1, k2, k3, k4] => ([k1, k2, k3, k4], [p1, p2]),
+            [k1, k2, k3, k4, p1, p2] => ([k1, k2, k3, k4], [p1, p2]),
             _ => {
-                let (count, expected) = (list.len(), if is_aria { "12" } else { "4 or 6" });
-                let what = format!("distortion_params has {count} numbers, expected {expected} for {model}");
+                let what = format!("distortion_params has {} numbers, expected 4 or 6 for {model}", list.len());
                 return Err(unusable(&what));
             }
-        }
-        let ([k1, k2, k3, k4, k5, k6], [p1, p2]) = (radial, tangential);
-        let [sx, sy] = self.numbers(["sx1", "sy1"])?.map(or_zero);
+        };
+        let ([k1, k2, k3, k4], [p1, p2]) = (radial, tangential);
         let is_rational = k5 != 0.0 || k6 != 0.0;
         let lens = match model.as_str() {
             // nerfstudio's k4 is the coefficient of r^8, and OpenCV's one of a divisor.
-            name if PERSPECTIVE.contains(&name) && !is_rational => {
-                Some(Lens { radial: [k1, k2, k3, k4, 0.0, 0.0], tangential, ..Lens::default() })
-            }
+            name if PERSPECTIVE.contains(&name) && !is_rational => Some(Lens { radial, tangential, ..Lens::default() }),
             name if name == "FULL_OPENCV" || PERSPECTIVE.contains(&name) => {
                 Lens::from_colmap("FULL_OPENCV", &[k1, k2, p1, p2, k3, k4, k5, k6])
             }
-            name if FISHEYE.contains(&name) => Lens::from_colmap("OPENCV_FISHEYE", &[k1, k2, k3, k4]),
+            name if FISHEYE.contains(&name) => Lens::from_colmap("OPENCV_FISHEYE", &radial),
             "THIN_PRISM_FISHEYE" => Lens::from_colmap(&model, &[k1, k2, p1, p2, k3, k4, sx, sy]),
-            "FOV" => {
-                let omega = self.value("omega")?.ok_or_else(|| unusable(&"expected omega of the FOV camera"))?;
-                Lens::from_colmap(&model, &[omega])
-            }
-            _ if is_aria => Lens::from_colmap("RAD_TAN_THIN_PRISM_FISHEYE", &list),
             _ => None,
         };
         let lens = lens.ok_or_else(|| {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::files::listing::decode_name;
-use crate::geometry::lens::{Lens, Projection};
+use crate::geometry::lens::Lens;
 use crate::image::codec::{
     apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha, read_header,
 };
@@ -130,7 +130,7 @@ impl Photo {
         (lens, undistort): (Lens, bool),
     ) -> Result<Self, DataError> {
         intrinsics_norm.validate()?;
-        if !undistort && lens.projection != Projection::Perspective {
+        if !undistort && lens.is_fisheye {
             let what =
                 "the images of a fisheye lens are not those of a pinhole camera; set data.files.undistort to true";
             return Err(DataError::bad_camera(what.into()));
