@@ -82,16 +82,12 @@ fn colmap_lenses_are_undistorted_unless_ignored() {
     for (line, fx, fy, num_distortion) in [
         ("pinhole 64 36 56 57 31 19", 56.0, 57.0, 0),
         ("RADIAL 64 36 56 31 19 0.1 -0.03", 56.0, 56.0, 2),
-        ("OPENCV 64 36 56 57 31 19 0.1 -0.03", 56.0, 57.0, 2),
+        ("OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001", 56.0, 57.0, 4),
         ("FULL_OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001 0.01 0.05 0.01 0.02", 56.0, 57.0, 8),
     ] {
         let (root, image) = colmap(line);
         let words: Vec<&str> = line.split(' ').collect();
-        let mut params: Vec<f64> =
-            words[words.len() - num_distortion..].iter().map(|word| word.parse().unwrap()).collect();
-        if (words[0], num_distortion) == ("OPENCV", 2) {
-            params.extend([0.0; 2]);
-        }
+        let params: Vec<f64> = words[words.len() - num_distortion..].iter().map(|word| word.parse().unwrap()).collect();
         let (norm, lens) = (norm(fx, fy), Lens::from_colmap(words[0], &params).unwrap());
         let ignored = open(root.path(), Some(false));
         assert_eq!(ignored.cameras(0).unwrap()[0].intrinsics, norm, "{line}");

@@ -31,10 +31,7 @@ impl ColmapCamera {
                 MODELS.iter().filter(|(_, num_focal, _)| *num_focal > 0).map(|(name, ..)| *name).collect();
             format!("the model is {}, expected one of {}", self.model, names.join(", "))
         })?;
-        let mut params = self.params.clone();
-        if name == "OPENCV" && params.len() == 6 {
-            params.extend([0.0; 2]); // without tangential terms
-        }
+        let params = &self.params;
         let expected = num_focal + 2 + num_distortion;
         let wrong_number = || format!("{name} has {} parameters, expected {expected}", params.len());
         if params.len() != expected {
