@@ -36,11 +36,12 @@ pub(crate) fn init_from(
     // The sizes of a weight file without a config are unknown.
     let mut adapter = NetworkAdapter::default();
     if let Ok(found) = ModelPath::find(path) {
-        adapter = NetworkAdapter::find(&config.model, &found.dir)?;
+        let found_adapter = NetworkAdapter::find(&config.model, &found.dir)?;
         if stage == Stage::Stage2 {
+            // The condenser is the same for longer patches and more blocks, and the other networks are trained.
             check_condenser(&config.model, &found.dir)?;
-            // The other networks, with their blocks, are trained.
-            adapter.num_blocks = None;
+        } else {
+            adapter = found_adapter;
         }
     }
     let mut loaded = load_adapted(&mut model, &part, path, adapter)?;
