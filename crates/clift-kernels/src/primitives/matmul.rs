@@ -4,7 +4,7 @@
 use std::mem::MaybeUninit;
 
 use crate::primitives::packing::has_matrix_tiles;
-use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, MAX_LANES, Operands, Simd, Tile};
+use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile};
 
 /// Lanes of A that are laid out for matrix tiles at a time.
 const MATRIX_BLOCK: usize = 4 * MATRIX_LANES;
@@ -60,13 +60,13 @@ pub(crate) fn multiply<S: Simd, O: Operands>(
     assert!(a.values.len() > (rows - 1) * a.row + (inner - 1) * a.step, "A has `rows` rows");
     assert!(b.values.len() >= last_panel * b.panel + (inner - 1) * b.step + last_columns, "B has all panels");
     assert!(c.len() >= (rows - 1) * c_row + columns, "C has `rows` rows");
-    if has_matrix_tiles::<S, O>() {
-        // SAFETY: by the three assertions above.
-        return unsafe { multiply_matrix_tiles(simd, [rows, inner, columns], a, b, (c, c_row), accumulate) };
-    }
+    // Rows and columns that fill no matrix tile are left to the register tile.
+    let whole_rows = if has_matrix_tiles::<S, O>() { rows / MATRIX_ROWS * MATRIX_ROWS } else { 0 };
+    // SAFETY: by the three assertions above.
+    unsafe { multiply_matrix_tiles(simd, [whole_rows, inner, columns / width * width], a, b, (c, c_row), accumulate) };
     for panel in 0..=last_panel {
         let vectors = if panel == last_panel { last_columns / S::LANES } else { S::TILE_VECTORS };
-        let mut row = 0;
+        let mut row = if vectors == S::TILE_VECTORS { whole_rows } else { 0 };
         while row < rows {
             // SAFETY: the three assertions above cover rows `row..row + ..` of A and C and the panel of B.
             unsafe {
@@ -87,8 +87,7 @@ pub(crate) fn multiply<S: Simd, O: Operands>(
     }
 }
 
-/// Computes [`multiply`] by matrix tiles. A is read where it lies if its rows are contiguous and fill a tile; otherwise, blocks of
-/// it are copied.
+/// Computes [`multiply`] by matrix tiles, of which the rows and columns are multiples. A transposed A is copied in blocks.
 ///
 /// # Safety
 /// A has `rows` rows of `inner` lanes, B all panels of `columns` columns, and C `rows` rows of `columns` columns.
@@ -101,115 +100,53 @@ unsafe fn multiply_matrix_tiles<S: Simd>(
     (c, c_row): (&mut [f32], usize),
     accumulate: bool,
 ) {
-    assert!(inner.is_multiple_of(MATRIX_LANES), "operands are padded to whole tiles");
-    let width = panel_width::<S>();
-    assert!(width == MATRIX_ROWS && S::LANES == MATRIX_LANES, "a panel is a tile wide");
     let mut copied = [const { MaybeUninit::<f32>::uninit() }; MATRIX_ROWS * MATRIX_BLOCK];
-    let mut edge = [const { MaybeUninit::<f32>::uninit() }; MATRIX_ROWS * MATRIX_ROWS];
-    let (copied, edge) = (copied.as_mut_ptr().cast::<f32>(), edge.as_mut_ptr().cast::<f32>());
+    let copied = copied.as_mut_ptr().cast::<f32>();
+    let block = if a.step == 1 { inner } else { inner.min(MATRIX_BLOCK) };
     for row in (0..rows).step_by(MATRIX_ROWS) {
-        let count = MATRIX_ROWS.min(rows - row);
-        let in_place = a.step == 1 && count == MATRIX_ROWS;
-        let block = if in_place { inner } else { inner.min(MATRIX_BLOCK) };
         for lane in (0..inner).step_by(block) {
             let lanes = block.min(inner - lane);
-            let accumulate = accumulate || lane > 0;
-            // SAFETY: the rows and lanes are in A; the copy has room for a block.
-            let (left, left_row) = unsafe {
-                let from = a.values.as_ptr().add(row * a.row + lane * a.step);
-                if in_place {
-                    (from, a.row)
-                } else {
-                    copy_rows(simd, from, [a.row, a.step], [count, lanes], copied);
-                    (copied.cast_const(), MATRIX_BLOCK)
+            // SAFETY: the rows and lanes are in A, the panels in B, rows and columns in C; the copy has room for a block.
+            unsafe {
+                let mut left = (a.values.as_ptr().add(row * a.row + lane * a.step), a.row);
+                if a.step > 1 {
+                    copy_transposed(simd, left.0, a.step, lanes, copied);
+                    left = (copied, MATRIX_BLOCK);
                 }
-            };
-            for panel in 0..columns.div_ceil(width) {
-                let vectors = S::TILE_VECTORS.min(columns / S::LANES - panel * S::TILE_VECTORS);
-                let whole = count == MATRIX_ROWS && vectors == S::TILE_VECTORS;
-                // SAFETY: B has `vectors` vectors in this panel, C the `count` rows of them or `edge` a whole tile.
-                unsafe {
-                    let to = c.as_mut_ptr().add(row * c_row + panel * width);
-                    let tile = Tile {
+                for panel in 0..columns / MATRIX_ROWS {
+                    simd.multiply_tile(Tile {
                         inner: lanes,
-                        a: left,
-                        a_row: left_row,
+                        a: left.0,
+                        a_row: left.1,
                         a_step: 1,
                         b: b.values.as_ptr().add(panel * b.panel + lane * b.step),
                         b_step: b.step,
-                        c: if whole { to } else { edge },
-                        c_row: if whole { c_row } else { MATRIX_ROWS },
-                        accumulate: accumulate && whole,
-                    };
-                    simd.multiply_tile(tile, vectors);
-                    if !whole {
-                        copy_edge(simd, edge, [count, vectors], (to, c_row), accumulate);
-                    }
+                        c: c.as_mut_ptr().add(row * c_row + panel * MATRIX_ROWS),
+                        c_row,
+                        accumulate: accumulate || lane > 0,
+                    });
                 }
             }
         }
     }
 }
 
-/// Copies a block of A to rows of [`MATRIX_BLOCK`] lanes; missing rows are zero.
+/// Copies lanes of [`MATRIX_ROWS`] rows, whose columns are contiguous, to rows of [`MATRIX_BLOCK`] lanes.
 ///
 /// # Safety
-/// The block must be readable, `to` writable for all rows.
+/// The lanes must be readable, `to` writable for all rows.
 #[inline(always)]
-unsafe fn copy_rows<S: Simd>(
-    simd: S,
-    from: *const f32,
-    [row, step]: [usize; 2],
-    [rows, lanes]: [usize; 2],
-    to: *mut f32,
-) {
-    assert!(row == 1 || step == 1, "rows or columns of A are contiguous");
-    for (first, lane) in
-        (0..MATRIX_ROWS).step_by(S::LANES).flat_map(|r| (0..lanes).step_by(S::LANES).map(move |l| (r, l)))
-    {
-        let mut block = [simd.splat(0.0); MAX_LANES];
-        let count = rows.saturating_sub(first).min(S::LANES);
-        // SAFETY: by the caller's promise.
-        unsafe {
-            if step == 1 {
-                for (r, vector) in block.iter_mut().enumerate().take(count) {
-                    *vector = simd.load(from.add((first + r) * row + lane));
-                }
-            } else if count > 0 {
-                for (l, vector) in block.iter_mut().enumerate() {
-                    let column = from.add((lane + l) * step + first);
-                    *vector = if count == S::LANES {
-                        simd.load(column)
-                    } else {
-                        simd.read(std::slice::from_raw_parts(column, count))
-                    };
-                }
+unsafe fn copy_transposed<S: Simd>(simd: S, from: *const f32, step: usize, lanes: usize, to: *mut f32) {
+    for row in (0..MATRIX_ROWS).step_by(S::LANES) {
+        for lane in (0..lanes).step_by(S::LANES) {
+            // SAFETY: by the caller's promise.
+            unsafe {
+                let mut block = std::array::from_fn(|i| simd.load(from.add((lane + i) * step + row)));
                 simd.transpose(&mut block);
+                for (i, vector) in block.into_iter().enumerate() {
+                    simd.store(to.add((row + i) * MATRIX_BLOCK + lane), vector);
+                }
             }
-            for (r, vector) in block.into_iter().enumerate() {
-                simd.store(to.add((first + r) * MATRIX_BLOCK + lane), vector);
-            }
-        }
-    }
-}
-
-/// Writes rows and vectors of a tile to C, or adds them.
-///
-/// # Safety
-/// Both must have that many rows and vectors.
-#[inline(always)]
-unsafe fn copy_edge<S: Simd>(
-    simd: S,
-    edge: *const f32,
-    [rows, vectors]: [usize; 2],
-    (c, c_row): (*mut f32, usize),
-    accumulate: bool,
-) {
-    for (row, vector) in (0..rows).flat_map(|row| (0..vectors).map(move |vector| (row, vector * S::LANES))) {
-        // SAFETY: by the caller's promise.
-        unsafe {
-            let (value, to) = (simd.load(edge.add(row * MATRIX_ROWS + vector)), c.add(row * c_row + vector));
-            simd.store(to, if accumulate { simd.add(simd.load(to), value) } else { value });
         }
     }
 }

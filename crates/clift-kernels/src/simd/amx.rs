@@ -60,7 +60,7 @@ impl Drop for Tiles {
 /// # Safety
 /// The tiles of this thread must be configured. All values of A, B and C in the range of the sizes must be readable, those of C
 /// writable.
-pub unsafe fn multiply_tile(tile: Tile, vectors: usize) {
+pub unsafe fn multiply_tile(tile: Tile) {
     debug_assert!(tile.a_step == 1 && tile.inner.is_multiple_of(MATRIX_LANES) && tile.inner > 0, "whole tiles");
     // SAFETY: by the caller's promise. The registers are written before they are read.
     unsafe {
@@ -79,7 +79,7 @@ pub unsafe fn multiply_tile(tile: Tile, vectors: usize) {
             "tileloadd tmm4, [{a} + {a_row}]",
             "tileloadd tmm6, [{b} + {b_step}]",
             "tdpbf16ps tmm0, tmm4, tmm6",
-            "tileloadd tmm7, [{b_right} + {b_step}]",
+            "tileloadd tmm7, [{b} + {b_step} + 64]",
             "tdpbf16ps tmm1, tmm4, tmm7",
             "tileloadd tmm5, [{a_low} + {a_row}]",
             "tdpbf16ps tmm2, tmm5, tmm6",
@@ -87,7 +87,6 @@ pub unsafe fn multiply_tile(tile: Tile, vectors: usize) {
             "add {a}, 64",
             "add {a_low}, 64",
             "add {b}, {b_next}",
-            "add {b_right}, {b_next}",
             "dec {count}",
             "jnz 2b",
             "tilestored [{c} + {c_row}], tmm0",
@@ -99,7 +98,6 @@ pub unsafe fn multiply_tile(tile: Tile, vectors: usize) {
             a_low = inout(reg) tile.a.add(16 * tile.a_row) => _,
             a_row = in(reg) 4 * tile.a_row,
             b = inout(reg) tile.b => _,
-            b_right = inout(reg) tile.b.add(16 * (vectors - 1)) => _,
             b_step = in(reg) 4 * tile.b_step,
             b_next = in(reg) 4 * tile.b_step * MATRIX_LANES,
             c = in(reg) tile.c,

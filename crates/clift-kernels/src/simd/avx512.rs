@@ -113,9 +113,9 @@ impl<const BF16: bool, const AMX: bool> Simd for Avx512<BF16, AMX> {
         }
     }
     #[inline(always)]
-    unsafe fn multiply_tile(self, tile: Tile, vectors: usize) {
+    unsafe fn multiply_tile(self, tile: Tile) {
         assert!(AMX, "only with matrix tiles");
-        unsafe { amx::multiply_tile(tile, vectors) };
+        unsafe { amx::multiply_tile(tile) };
     }
     #[inline(always)]
     fn transpose(self, rows: &mut [__m512; MAX_LANES]) {

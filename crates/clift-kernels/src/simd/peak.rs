@@ -57,7 +57,7 @@ fn matrix_rounds<S: Simd>(simd: S) -> f64 {
         // B has the size of A.
         let tile = Tile { inner: INNER, a, a_row: INNER, a_step: 1, b: a, b_step: rows, c, c_row: rows, accumulate };
         // SAFETY: both slices have the sizes of the tile.
-        unsafe { simd.multiply_tile(tile, S::TILE_VECTORS) };
+        unsafe { simd.multiply_tile(tile) };
     }
     black_box(c);
     (ROUNDS / INNER * 2 * 2 * MATRIX_ROWS * MATRIX_ROWS * INNER) as f64

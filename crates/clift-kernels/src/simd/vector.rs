@@ -61,12 +61,12 @@ pub trait Simd: Copy + Send + Sync + 'static {
     }
 
     /// Runs a tile of pairs with [`MATRIX_ROWS`] rows and as many columns, as [`Tile::run`]. The inner dimension is a multiple
-    /// of [`MATRIX_LANES`], the step of A is 1. With one vector B has 16 columns only, and the others of C are undefined.
+    /// of [`MATRIX_LANES`], the step of A is 1.
     ///
     /// # Safety
     /// That of [`Tile::run`].
     #[inline(always)]
-    unsafe fn multiply_tile(self, _tile: Tile, _vectors: usize) {
+    unsafe fn multiply_tile(self, _tile: Tile) {
         unreachable!("only with matrix tiles");
     }
 
