@@ -272,14 +272,6 @@ fn one_bad_camera_of_a_colmap_model_costs_its_frame() {
             assert!(frame == name && reason.contains(what), "{to}: {report}");
         }
     }
-    // A camera of an unknown model, which no image uses, after the others.
-    let root = copy_of_layout("colmap_bin");
-    let path = root.path().join("attic/sparse/0/cameras.bin");
-    let mut bytes = fs::read(&path).unwrap();
-    bytes[0] += 1;
-    bytes.extend([&9_u32.to_le_bytes()[..], &77_i32.to_le_bytes(), &[1; 16], &[0; 24]].concat());
-    fs::write(&path, bytes).unwrap();
-    assert_eq!(open_test(root.path()).unwrap().source.num_frames(0).unwrap(), 6);
 }
 
 #[test]

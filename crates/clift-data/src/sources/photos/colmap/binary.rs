@@ -27,16 +27,14 @@ fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
         let id = u32::from_le_bytes(file.take()?);
         let model = i32::from_le_bytes(file.take()?);
         let (width, height) = (u64::from_le_bytes(file.take()?), u64::from_le_bytes(file.take()?));
-        let camera = match usize::try_from(model).ok().and_then(|model| MODELS.get(model)) {
-            Some(&(name, num_focal, num_distortion)) => {
-                let params = (0..num_focal + 2 + num_distortion).map(|_| file.take().map(f64::from_le_bytes));
-                Ok(ColmapCamera { model: name.into(), width, height, params: params.collect::<Result<_, _>>()? })
-            }
-            None if index + 1 == count => Err(format!("the unknown model {model}")),
-            // The number of its parameters is unknown, thus where the next camera begins.
-            None => return Err(file.bad(format!("camera {index} of {count} has the unknown model {model}"))),
-        };
-        add_camera(&mut cameras, id, camera).map_err(|what| file.bad(what))?;
+        // Of an unknown model the number of parameters is unknown, thus where the next camera begins.
+        let &(name, num_focal, num_distortion) = usize::try_from(model)
+            .ok()
+            .and_then(|model| MODELS.get(model))
+            .ok_or_else(|| file.bad(format!("camera {index} of {count} has the unknown model {model}")))?;
+        let params = (0..num_focal + 2 + num_distortion).map(|_| file.take().map(f64::from_le_bytes));
+        let camera = ColmapCamera { model: name.into(), width, height, params: params.collect::<Result<_, _>>()? };
+        add_camera(&mut cameras, id, Ok(camera)).map_err(|what| file.bad(what))?;
     }
     Ok(cameras)
 }
