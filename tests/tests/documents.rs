@@ -272,7 +272,7 @@ fn prepare(base: &Path) {
         let run_dir = format!("run_dir={run}");
         clift(&["train", config.to_str().expect("text"), "--set", &run_dir, "--set", key]);
     };
-    train("runs/tiny", "eval.formats=['f32', 'int8']");
+    train("runs/tiny", "eval.formats=['f32', 'f16']");
     train("runs/re10k", SMALL_DATA);
     // An example replaces PATH.
     train("runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR"));

@@ -25,12 +25,12 @@ pub fn fit_token_codec(
 ) -> Result<usize, TrainError> {
     let (model, weights) = model;
     if !config.model.architecture.supports_clusters() {
-        let fix = "the token codec is one of condensed tokens; those of this network are stored in f32, f16 or int8";
+        let fix = "the token codec is one of condensed tokens; those of this network are stored in f32 or f16";
         return Err(bad("model.architecture", format!("\"{}\"", config.model.architecture), fix));
     }
     if config.clusters.grouping != Grouping::Kmeans {
         let grouping: &str = config.clusters.grouping.into();
-        let fix = "the token codec is one of K-means tokens; tokens of other groups are stored in f32, f16 or int8";
+        let fix = "the token codec is one of K-means tokens; tokens of other groups are stored in f32 or f16";
         return Err(bad("clusters.grouping", format!("\"{grouping}\""), fix));
     }
     let source = &reader.source;

@@ -60,7 +60,7 @@ pub enum Command {
     /// Evaluate a run or model on test views
     #[command(after_help = "\
 Examples:
-  clift eval runs/tiny --stored-tokens 8,1/4,1.0 --format f32,f16,int8 --out runs/tiny/formats
+  clift eval runs/tiny --stored-tokens 8,1/4,1.0 --format f32,f16,coded --out runs/tiny/formats
   clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"' --out lpips")]
     Eval(EvalArgs),
     /// Compare two evaluations view by view, with confidence intervals

@@ -26,7 +26,7 @@ impl Setup {
         let run_dir = format!("run_dir={:?}", text(&run));
         let micro = text(&Path::new(env!("CARGO_MANIFEST_DIR")).join("micro.toml"));
         clift(&["train", &micro, "--set", &run_dir])?;
-        for storage in ["f32", "f16", "int8", "coded"] {
+        for storage in ["f32", "f16", "coded"] {
             let out = text(&place(&format!("room-{storage}.clift")));
             let scene = ["--scene", "synthetic-0-test-00000", "--format", storage, "-o", &out];
             clift(&[&["encode", &text(&run)], &scene[..]].concat())?;

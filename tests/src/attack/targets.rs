@@ -53,9 +53,7 @@ pub const TARGETS: &[Target] = &[
             file(s, "config.toml", |path| done(read_checked_config(path, &[], Config::validate))),
         )
     }),
-    target("scene-file", words::SAFETENSORS, |s| {
-        (["f32", "f16", "int8"].map(|format| room(s, format)).into(), scene_file(s))
-    }),
+    target("scene-file", words::SAFETENSORS, |s| (["f32", "f16"].map(|format| room(s, format)).into(), scene_file(s))),
     Target {
         repair: scene_checksum,
         ..target("coded-scene", words::SAFETENSORS, |s| (vec![room(s, "coded")], scene_file(s)))

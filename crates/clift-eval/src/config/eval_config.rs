@@ -23,8 +23,8 @@ pub struct EvalConfig {
     /// Rendered methods of `random`, `tile`, `tile_clift`, `kmeans`, `clift` and `lvsm_ed`; empty for all methods with
     /// weights.
     pub methods: Vec<Method>,
-    /// Formats of the stored tokens, as in a scene file, to compare: `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss
-    /// as measured when the codec was fitted) and `coded-DB`.
+    /// Formats of the stored tokens, as in a scene file, to compare: `f32`, `f16`, `coded` (at most 0.02 dB of loss as
+    /// measured when the codec was fitted) and `coded-DB`.
     pub formats: Vec<TokenCoding>,
     /// LPIPS weights, converted by `scripts/tools/convert_vgg.py`. LPIPS is not measured without weights.
     pub lpips_weights: Option<PathBuf>,

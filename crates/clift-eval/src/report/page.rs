@@ -265,11 +265,11 @@ mod tests {
         }
         let mut several = results();
         assert!(!page(&several, 0).contains("clift, f32"), "a single format is not named");
-        let int8 = EvalKey { tokens: Some(TokenCoding::INT8), ..key(Method::Clift, 8, 8) };
-        several.add("a", 3, int8, ViewMetrics::quality(17.5, None));
-        several.add_scene_bytes(int8, 2000);
+        let f16 = EvalKey { tokens: Some(TokenCoding::F16), ..key(Method::Clift, 8, 8) };
+        several.add("a", 3, f16, ViewMetrics::quality(17.5, None));
+        several.add_scene_bytes(f16, 2000);
         let html = page(&several, 0);
-        for part in ["</svg>clift, f32</li>", "</svg>clift, int8</li>", "</svg>random</li>", "<td>int8</td>"] {
+        for part in ["</svg>clift, f32</li>", "</svg>clift, f16</li>", "</svg>random</li>", "<td>f16</td>"] {
             assert!(html.contains(part), "{part}");
         }
     }

@@ -138,8 +138,6 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_scene::TokenCoding;
-
     use crate::config::method::Method;
     use crate::statistics::eval_results::EvalResults;
     use crate::statistics::summary::Summary;
@@ -149,7 +147,6 @@ mod tests {
     #[test]
     fn table_columns_are_aligned() {
         let mut views = EvalResults::default();
-        let key = EvalKey { tokens: Some(TokenCoding::INT8), ..CLIFT };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
             let measured = ViewMetrics {
                 sharpness: Some(psnr / 25.0),
@@ -157,11 +154,11 @@ mod tests {
                 select_s: Some(0.01),
                 ..ViewMetrics::quality(psnr, Some(psnr / 100.0))
             };
-            views.add(scene, 0, key, measured);
+            views.add(scene, 0, CLIFT, measured);
         }
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5)));
         let cost = Cost { gflops: Some(45.23), scene_bytes: Some(99_000), coded_bytes: Some(9_950), ..Cost::default() };
-        views.costs.insert(key, cost);
+        views.costs.insert(CLIFT, cost);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
@@ -169,7 +166,7 @@ mod tests {
 method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  sharp  render ms  frame ms  half ms     GMAC  scene kB  coded kB
 nearest_view  -       -         -       18.00    -      0.500  -      -      -          -         -           -     -         -
 mean_image    -       -         -       -        -      -      -      -      -          -         -           -     -         -
-clift         64      32        int8    20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  99.0      9.9       tb
+clift         64      32        f16     20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  99.0      9.9       tb
 
 frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
 t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes

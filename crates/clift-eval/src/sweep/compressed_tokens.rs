@@ -125,7 +125,7 @@ fn rounded(tokens: Tokens, format: TokenFormat) -> Result<Tokens, EvalError> {
     if format == TokenFormat::F32 {
         return Ok(tokens);
     }
-    let values = format.round(&tokens.to_host()?, tokens.dims()[2])?;
+    let values = format.round(&tokens.to_host()?)?;
     Ok(tokens.with_host_values(values))
 }
 

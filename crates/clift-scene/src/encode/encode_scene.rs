@@ -103,7 +103,7 @@ fn codec_for(
     match coding {
         Some(TokenCoding::Plain(_)) => Ok(None),
         Some(TokenCoding::Coded(_)) if !architecture.supports_clusters() => Err(SceneError::request(format!(
-            "the tokens of {architecture} have no codec; store them with --format f32, f16 or int8"
+            "the tokens of {architecture} have no codec; store them with --format f32 or f16"
         ))),
         Some(TokenCoding::Coded(loss)) => match TokenCodec::beside(weights, model)? {
             Some(codec) => Ok(Some((codec, loss))),

@@ -179,21 +179,15 @@ impl Tensors<'_> {
     fn tokens(&self, model: &ModelConfig) -> Result<(TokenFormat, usize, Vec<f32>), String> {
         // Its sizes bound what is allocated below.
         model.validate().map_err(|error| error.to_string())?;
-        let dim = model.dim;
         let dtype = self.view("tokens")?.dtype();
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));
-        let format = format.ok_or_else(|| format!("`tokens` is {dtype:?}, expected F32, F16 or I8"))?;
-        let places = if model.has_patch_tokens() { 2 } else { 0 };
-        let expected = 10 + places + usize::from(format == TokenFormat::Int8);
+        let format = format.ok_or_else(|| format!("`tokens` is {dtype:?}, expected F32 or F16"))?;
+        let expected = if model.has_patch_tokens() { 12 } else { 10 };
         if self.0.len() != expected {
             return Err(format!("{} tensors, expected {expected}", self.0.len()));
         }
         let count = model.num_learned_tokens().map_or_else(|| self.length("token_ids"), Ok)?;
-        let scales = if format == TokenFormat::Int8 { self.f32s("token_scales", &[count])? } else { Vec::new() };
-        if let Some(token) = scales.iter().position(|scale| !(scale.is_finite() && *scale >= 0.0)) {
-            return Err(format!("scale {} of token {token}, expected a finite number", scales[token]));
-        }
-        let bytes = self.data("tokens", dtype, &[count, dim])?;
-        Ok((format, count, format.decode(&bytes, &scales, dim)))
+        let bytes = self.data("tokens", dtype, &[count, model.dim])?;
+        Ok((format, count, format.decode(&bytes)))
     }
 }

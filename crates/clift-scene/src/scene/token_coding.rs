@@ -1,5 +1,4 @@
 //! Formats of the tokens of a scene file: plain numbers, or coded.
-// S storage tokens, D width
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,7 +10,7 @@ use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::tensors::{f32_bytes, numbers};
 
-/// Storage of tokens in configs, tables and on the command line: `f32`, `f16`, `int8`, `coded` or `coded-DB`.
+/// Storage of tokens in configs, tables and on the command line: `f32`, `f16`, `coded` or `coded-DB`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum TokenCoding {
@@ -49,10 +48,8 @@ impl TokenCoding {
     pub const F32: Self = Self::Plain(TokenFormat::F32);
     /// Plain 16-bit floats.
     pub const F16: Self = Self::Plain(TokenFormat::F16);
-    /// Plain 8-bit integers.
-    pub const INT8: Self = Self::Plain(TokenFormat::Int8);
     /// The names for messages and help texts.
-    pub const NAMES: &str = "f32, f16, int8, coded, coded-DB";
+    pub const NAMES: &str = "f32, f16, coded, coded-DB";
 }
 
 impl From<TokenFormat> for TokenCoding {
@@ -104,86 +101,58 @@ impl From<TokenCoding> for String {
     }
 }
 
-/// Largest magnitude of an 8-bit value; -128 is not used, so that the range is symmetric.
-const INT8_MAX: f32 = 127.0;
-
 /// Number format of the tokens in a scene file.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[derive(Display, IntoStaticStr, VariantArray)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum TokenFormat {
     /// 32-bit floats, without rounding.
     F32,
     /// 16-bit floats, with a relative error of 5e-4.
-    #[default]
     F16,
-    /// 8-bit integers with a 32-bit scale per token, with errors of 1/254 of the token's largest value.
-    Int8,
 }
 
 impl TokenFormat {
     /// All formats, in the order of messages and help texts.
-    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+    pub const ALL: [Self; 2] = *Self::VARIANTS.as_array().expect("two variants");
 
     /// Returns the name on the command line.
     pub fn name(self) -> &'static str {
         self.into()
     }
 
-    /// Returns the bytes of one token of width `dim`, with its scale if the format has one.
+    /// Returns the bytes of one token of width `dim`.
     pub const fn bytes_per_token(self, dim: usize) -> usize {
         match self {
             Self::F32 => 4 * dim,
             Self::F16 => 2 * dim,
-            Self::Int8 => dim + 4,
         }
     }
 
-    /// Rounds tokens `[S, D]` as writing and reading a file does.
-    pub fn round(self, tokens: &[f32], dim: usize) -> Result<Vec<f32>, ModelError> {
-        let (bytes, scales) = self.encode(tokens, dim)?;
-        Ok(self.decode(&bytes, &scales.unwrap_or_default(), dim))
+    /// Rounds tokens as writing and reading a file does.
+    pub fn round(self, tokens: &[f32]) -> Result<Vec<f32>, ModelError> {
+        Ok(self.decode(&self.encode(tokens)?))
     }
 
-    /// Encodes tokens `[S, D]` as little-endian bytes, with a scale per token for 8 bits.
-    pub(crate) fn encode(self, tokens: &[f32], dim: usize) -> Result<(Vec<u8>, Option<Vec<f32>>), ModelError> {
+    /// Encodes tokens as little-endian bytes.
+    pub(crate) fn encode(self, tokens: &[f32]) -> Result<Vec<u8>, ModelError> {
         match self {
-            Self::F32 => Ok((f32_bytes(tokens.iter().copied()), None)),
+            Self::F32 => Ok(f32_bytes(tokens.iter().copied())),
             Self::F16 => {
                 let rounded: Vec<f16> = tokens.iter().map(|&value| f16::from_f32(value)).collect();
                 if let Some(position) = rounded.iter().position(|value| !value.is_finite()) {
-                    let fix = format!(
-                        "a token contains {}, the largest 16-bit float is 65504; write f32 or int8",
-                        tokens[position]
-                    );
+                    let value = tokens[position];
+                    let fix = format!("a token contains {value}, the largest 16-bit float is 65504; write f32");
                     return Err(ModelError::BadConfig { key: "tokens", value: "f16".into(), fix });
                 }
-                Ok((rounded.iter().flat_map(|value| value.to_le_bytes()).collect(), None))
-            }
-            Self::Int8 => {
-                let (mut bytes, mut scales) = (Vec::with_capacity(tokens.len()), Vec::new());
-                for token in tokens.chunks_exact(dim) {
-                    let scale = token.iter().fold(0.0_f32, |most, value| most.max(value.abs())) / INT8_MAX;
-                    scales.push(scale);
-                    // Zeros, and values whose scale is subnormal, become zeros.
-                    let inverse = if scale.is_normal() { scale.recip() } else { 0.0 };
-                    let rounded = token.iter().map(|value| (value * inverse).round().clamp(-INT8_MAX, INT8_MAX) as i8);
-                    bytes.extend(rounded.map(|value| value as u8));
-                }
-                Ok((bytes, Some(scales)))
+                Ok(rounded.iter().flat_map(|value| value.to_le_bytes()).collect())
             }
         }
     }
 
-    pub(crate) fn decode(self, bytes: &[u8], scales: &[f32], dim: usize) -> Vec<f32> {
+    pub(crate) fn decode(self, bytes: &[u8]) -> Vec<f32> {
         match self {
             Self::F32 => numbers(bytes, f32::from_le_bytes),
             Self::F16 => numbers(bytes, |bytes| f16::from_le_bytes(bytes).to_f32()),
-            Self::Int8 => {
-                let tokens = bytes.chunks_exact(dim).zip(scales);
-                tokens.flat_map(|(token, scale)| token.iter().map(move |&byte| f32::from(byte as i8) * scale)).collect()
-            }
         }
     }
 }
@@ -192,39 +161,21 @@ impl TokenFormat {
 mod tests {
     use super::*;
 
-    const DIM: usize = 4;
-
-    fn round_trip(format: TokenFormat, tokens: &[f32]) -> Vec<f32> {
-        let (bytes, scales) = format.encode(tokens, DIM).unwrap();
-        let with_scales = bytes.len() + 4 * scales.as_ref().map_or(0, Vec::len);
-        assert_eq!(with_scales, tokens.len() / DIM * format.bytes_per_token(DIM));
-        format.decode(&bytes, &scales.unwrap_or_default(), DIM)
-    }
-
     #[test]
     fn rounding_errors_are_within_each_formats_bound() {
         let tokens: Vec<f32> = (0..400).map(|i| ((i * 7919 % 1000) as f32 - 500.0) * 0.013).collect();
-        assert_eq!(round_trip(TokenFormat::F32, &tokens), tokens);
-        for (got, value) in round_trip(TokenFormat::F16, &tokens).iter().zip(&tokens) {
+        assert_eq!(TokenFormat::F32.round(&tokens).unwrap(), tokens);
+        for (got, value) in TokenFormat::F16.round(&tokens).unwrap().iter().zip(&tokens) {
             assert!((got - value).abs() <= value.abs() / 2048.0, "{got} against {value}");
         }
-        for (got, token) in round_trip(TokenFormat::Int8, &tokens).chunks(DIM).zip(tokens.chunks(DIM)) {
-            let largest = token.iter().fold(0.0_f32, |most, value| most.max(value.abs()));
-            let is_near = |(got, value): (&f32, &f32)| (got - value).abs() <= largest / 253.9;
-            assert!(got.iter().zip(token).all(is_near), "{got:?} against {token:?}");
-        }
-        for format in TokenFormat::ALL {
-            let tiny = round_trip(format, &[1e-42, -1e-42, 0.0, 1e-45]);
-            assert!(tiny.iter().all(|value| value.is_finite() && value.abs() < 1e-41), "{tiny:?}");
-        }
-        assert_eq!(round_trip(TokenFormat::Int8, &[-3.0, 3.0, 0.0, 1.5])[..2], [-3.0, 3.0]);
-        let message = TokenFormat::F16.encode(&[1.0, 7e4, 0.0, 0.0], DIM).unwrap_err().to_string();
-        assert!(message.ends_with("a token contains 70000, the largest 16-bit float is 65504; write f32 or int8"));
+        assert_eq!(TokenFormat::F16.round(&[1e-42, -1e-42, 0.0]).unwrap(), [0.0; 3]);
+        let message = TokenFormat::F16.round(&[1.0, 7e4]).unwrap_err().to_string();
+        assert!(message.ends_with("a token contains 70000, the largest 16-bit float is 65504; write f32"), "{message}");
     }
 
     #[test]
     fn names_parse_and_others_are_refused() {
-        for name in ["f32", "f16", "int8", "coded", "coded-0.1", "coded-2"] {
+        for name in ["f32", "f16", "coded", "coded-0.1", "coded-2"] {
             assert_eq!(name.parse::<TokenCoding>().unwrap().to_string(), name);
         }
         assert_eq!("coded-0.02".parse::<TokenCoding>().unwrap().to_string(), "coded");

@@ -56,7 +56,7 @@ impl Scene {
     /// Writes the scene atomically, with tokens as plain numbers.
     pub fn write(&self, path: &Path, format: TokenFormat) -> Result<(), ModelError> {
         self.check().map_err(|reason| refusal_to_write(path, reason, FEWER))?;
-        let (tokens, scales) = format.encode(&self.tokens, self.model.dim)?;
+        let tokens = format.encode(&self.tokens)?;
         let (count, views, groups) = (self.num_tokens(), self.context.len(), self.groups.len());
         let sizes = u32_bytes(self.groups.iter().map(|group| group.views.len() as u32));
         let members = u32_bytes(self.groups.iter().flat_map(|group| group.views.iter().copied()));
@@ -76,9 +76,6 @@ impl Scene {
         if has_places {
             let rays = self.plucker_rays().into_iter().flatten().map(|value| value as f32);
             tensors.push(("token_rays", "F32", vec![count, 6], f32_bytes(rays)));
-        }
-        if let Some(scales) = scales {
-            tensors.push(("token_scales", "F32", vec![count], f32_bytes(scales)));
         }
         tensors.push(("group_sizes", "U32", vec![groups], sizes));
         tensors.push(("group_views", "U32", vec![members.len() / 4], members));

@@ -62,7 +62,7 @@ pub struct EncodeArgs {
     /// With many groups the default falls to 1/8. A number below 32 tokens a group makes fewer groups, which leave photos out.
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
-    /// Format of the tokens: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]
+    /// Format of the tokens: f32, f16, coded or coded-DB [default: coded with a codec, else f16]
     ///
     /// `coded` needs the token codec of the model, which training fits (`clift codec` for other models). Its step is the
     /// one that lost 0.02 dB on training scenes, or DB with `coded-DB`.

@@ -128,7 +128,7 @@ pub struct EvalArgs {
     /// Select rendered tokens by this rule: paper, global, scaled or random
     #[arg(long, value_name = "PRESET")]
     pub selection: Option<Selection>,
-    /// Formats of the tokens: f32, f16, int8, coded, or coded-DB, e.g. f16,coded-0.1
+    /// Formats of the tokens: f32, f16, coded, or coded-DB, e.g. f16,coded-0.1
     #[arg(long = "format", value_delimiter = ',', value_name = "FORMAT")]
     pub formats: Vec<TokenCoding>,
     /// Evaluation index (JSON): context and target frames of every scene

@@ -88,7 +88,7 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
             let bytes = std::fs::read(folder.path()).expect("reads");
             let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * (place + format.bytes_per_token(DIM));
             assert_eq!((bytes.len(), scene.file_bytes(format)), (expected, expected as u64), "{format}");
-            let tokens = format.round(&scene.tokens, DIM).expect("in range");
+            let tokens = format.round(&scene.tokens).expect("in range");
             assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..scene.clone() }, format.into()));
             scene.write(&folder.path(), format).expect("writes");
             assert_eq!(std::fs::read(folder.path()).expect("reads"), bytes, "equal scenes are equal files");
@@ -140,10 +140,10 @@ fn latents() -> Scene {
 #[test]
 fn other_latents_than_those_of_the_network_are_refused() {
     let (folder, latents) = (Folder::new(), latents());
-    latents.write(&folder.path(), TokenFormat::Int8).expect("writes");
+    latents.write(&folder.path(), TokenFormat::F16).expect("writes");
     let bytes = std::fs::read(folder.path()).expect("reads");
     let fewer = with_header(&bytes, &[(r#"num_latents\":5"#, r#"num_latents\":4"#)]);
-    folder.assert_refused(&fewer, "`token_scales` is F32 [5], expected F32 [4]");
+    folder.assert_refused(&fewer, "`tokens` is F16 [5, 8], expected F16 [4, 8]");
     let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
     folder.assert_not_written(&few, TokenFormat::F32, "expected all 5 learned tokens in order");
     let kind = Scene { kind: TokenKind::Clift, ..latents };
@@ -155,7 +155,7 @@ fn damaged_files_are_refused_with_a_remedy() {
     let folder = Folder::new();
     folder.assert_refused(&[9, 0, 0], "the file is truncated: 3 bytes; copy it again");
     folder.assert_refused(b"\x89PNG\r\n\x1a\n and so on", "give a file that `clift encode` wrote");
-    let bytes = folder.bytes(TokenFormat::Int8);
+    let bytes = folder.bytes(TokenFormat::F16);
     let length = 8 + HEADER_BYTES - 1;
     folder.assert_refused(&bytes[..length], "truncated: 2055 bytes with a header of 2048 bytes; copy");
     let cut = "the file is truncated or has bytes after its last tensor; copy it again";
@@ -198,7 +198,7 @@ fn invalid_headers_are_refused() {
         (r#""width":"24""#, r#""width":"18446744073709551608""#, "expected at most 16384 a side"),
         // Names, types and shapes of tensors.
         (r#""shape":[5, 8]"#, r#""shape":[8, 5]"#, "`tokens` is F32 [8, 5], expected F32 [5, 8]"),
-        (r#""F32","shape":[5, 8]"#, r#""I32","shape":[5, 8]"#, "`tokens` is I32, expected F32, F16 or I8"),
+        (r#""F32","shape":[5, 8]"#, r#""I32","shape":[5, 8]"#, "`tokens` is I32, expected F32 or F16"),
         (r#""U32","shape":[5]"#, r#""U32","shape":[5, 1]"#, "`token_ids` has the shape [5, 1], expected one dimension"),
         (r#""tokens":"#, r#""tokens":{"dtype":"F32","shape":[0],"data_offsets":[0,0]},"more":"#, ""),
     ] {
@@ -215,13 +215,11 @@ fn invalid_headers_are_refused() {
 #[test]
 fn invalid_tensor_values_are_refused() {
     let (f32_nan, f64_nan) = (f32::NAN.to_le_bytes(), f64::NAN.to_le_bytes());
-    let (f32, f16, int8) = (TokenFormat::F32, TokenFormat::F16, TokenFormat::Int8);
+    let [f32, f16] = TokenFormat::ALL;
     let last_row = "context camera 0: bad camera: the last row of the pose is [0.0, 0.0, 0.0, 0.5]";
     let cases: &[(TokenFormat, &str, usize, &[u8], &str)] = &[
         (f32, "tokens", 4 * 17, &f32_nan, "token 2 contains NaN"),
         (f16, "tokens", 2 * 8, &half::f16::INFINITY.to_le_bytes(), "token 1 contains inf"),
-        (int8, "token_scales", 0, &(-1.0_f32).to_le_bytes(), "scale -1 of token 0"),
-        (int8, "token_scales", 0, &f32::MAX.to_le_bytes(), "token 0 contains -inf"),
         (f32, "token_rays", 24 + 8, &f32_nan, "ray of token 1: "),
         (f32, "context_c2w", 8 * 16, &f64_nan, "context camera 1: bad camera: the pose holds NaN"),
         (f32, "context_c2w", 8 * 15, &0.5_f64.to_le_bytes(), last_row),
