@@ -95,9 +95,7 @@ fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
         ("cumulative", Dtype::F32, vec![dim, knots], f32s(&distributions.cumulative)),
         ("rate_shares", Dtype::F64, vec![counts], f64s(&rates.shares)),
         ("rate_steps", Dtype::F64, vec![steps], f64s(&rates.steps)),
-        ("rate_bits", Dtype::F64, vec![counts, steps], f64s(&rates.bits)),
         ("rate_loss", Dtype::F64, vec![counts, steps], f64s(&rates.loss)),
-        ("rate_psnr", Dtype::F64, vec![counts], f64s(&rates.psnr)),
         ("weights", Dtype::F32, vec![NUM_CLASSES, dim, 2], f32s(&prediction.weights)),
         ("scales", Dtype::F32, vec![NUM_CLASSES, dim], f32s(&prediction.scales)),
     ];
@@ -162,9 +160,7 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     let rates = RateTable {
         shares: f64s("rate_shares", &[counts])?,
         steps: f64s("rate_steps", &[steps])?,
-        bits: f64s("rate_bits", &[counts, steps])?,
         loss: f64s("rate_loss", &[counts, steps])?,
-        psnr: f64s("rate_psnr", &[counts])?,
     };
     let rates = rates.checked().map_err(|error| error.to_string())?;
     let renderer_hash = field("renderer")?.clone();

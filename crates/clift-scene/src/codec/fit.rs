@@ -1,5 +1,5 @@
 //! Fits the token codec of a model on training scenes: the transform on second moments and on how much renderings change
-//! with every direction, the prediction and the distributions in further passes, then bits and loss of every count and step on
+//! with every direction, the prediction and the distributions in further passes, then the loss of every count and step on
 //! renderings.
 // N encoder tokens, S stored tokens, D width
 
@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use burn::tensor::Tensor;
 use clift_core::{derive_seed, item_rng, mean};
 use clift_data::{Clip, ClipReader, EvaluationItem};
-use clift_model::{Cameras, KMeans, ModelError, TokenCount, TokenKind, Tokens, TrainedModel, Views, psnr_of_mse};
+use clift_model::{Cameras, KMeans, ModelError, TokenCount, TokenKind, Tokens, TrainedModel, Views};
 use rand::RngExt;
 
 use crate::codec::histogram::Histograms;
@@ -95,9 +95,7 @@ pub fn fit_codec(
 
     let kind = if model.has_condenser { TokenKind::Clift } else { TokenKind::Kmeans };
     let network = (model.config.clone(), kind, model.renderer_hash());
-    let zeros = vec![0.0; steps.len()];
-    let unknown =
-        RateTable { shares: vec![1.0], steps: steps.clone(), bits: zeros.clone(), loss: zeros, psnr: vec![0.0] };
+    let unknown = RateTable { shares: vec![1.0], steps: steps.clone(), loss: vec![0.0; steps.len()] };
     let codec = TokenCodec::new(network.clone(), (transform, prediction), histograms.distributions(), unknown)?;
     let mut rates = Vec::new();
     fit.for_each(measured, |fit, _, clip| {
@@ -223,24 +221,20 @@ impl Fit<'_> {
         for &count in &self.options.counts {
             let (tokens, ids) = self.stored(&lift, count, clip)?;
             let (places, values) = (self.places(&ids, clip), tokens.to_host()?);
-            let (num_tokens, exact) = (tokens.dims()[1] as f64, self.render(tokens.clone(), &cameras)?);
+            let exact = self.render(tokens.clone(), &cameras)?;
             let errors = view_errors(&exact, &truth, view_len);
-            let psnr: Vec<f64> = errors.iter().map(|&error| psnr_of_mse(error)).collect();
-            rates[0].push(num_tokens / lift.dims()[1] as f64);
-            rates[1].push(mean(&psnr).unwrap_or_default());
+            rates[0].push(tokens.dims()[1] as f64 / lift.dims()[1] as f64);
             for &step in steps {
-                let step = step as f32;
-                rates[2].push(codec.stream_bits(&values, places, step)? / num_tokens);
-                let rounded = tokens.with_host_values(codec.round(&values, places, step)?);
-                rates[3].push(loss(&exact, &self.render(rounded, &cameras)?, &errors));
+                let rounded = tokens.with_host_values(codec.round(&values, places, step as f32)?);
+                rates[1].push(loss(&exact, &self.render(rounded, &cameras)?, &errors));
             }
         }
         Ok(rates)
     }
 }
 
-/// Shares of all tokens and PSNRs by count, and bits per token and losses by count and step.
-type Rates = [Vec<f64>; 4];
+/// Shares of all tokens by count, and losses by count and step.
+type Rates = [Vec<f64>; 2];
 
 /// Returns the groups of neighbouring directions that noise is added to: single ones, then two per doubling.
 fn direction_groups(dim: usize) -> Vec<Range<usize>> {
@@ -288,14 +282,12 @@ fn rate_table(steps: Vec<f64>, scenes: &[Rates]) -> Result<RateTable, ModelError
         let values = |i: usize| scenes.iter().map(|rates| rates[part][i]).collect::<Vec<f64>>();
         (0..scenes[0][part].len()).map(|i| mean(&values(i)).unwrap_or(f64::NAN)).collect()
     };
-    let [shares, psnr, bits, loss] = [0, 1, 2, 3].map(mean_of);
+    let [shares, loss] = [0, 1].map(mean_of);
     let mut order: Vec<usize> = (0..shares.len()).collect();
     order.sort_by(|&a, &b| shares[a].total_cmp(&shares[b]));
     order.dedup_by(|a, b| shares[*a] == shares[*b]);
-    let counts = |values: &[f64]| order.iter().map(|&c| values[c]).collect();
-    let rows =
-        |values: &[f64]| order.iter().flat_map(|&c| &values[c * steps.len()..][..steps.len()]).copied().collect();
-    RateTable { shares: counts(&shares), bits: rows(&bits), loss: rows(&loss), psnr: counts(&psnr), steps }.checked()
+    let loss = order.iter().flat_map(|&c| &loss[c * steps.len()..][..steps.len()]).copied().collect();
+    RateTable { shares: order.iter().map(|&c| shares[c]).collect(), loss, steps }.checked()
 }
 
 #[cfg(test)]

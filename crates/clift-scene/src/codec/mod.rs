@@ -5,7 +5,7 @@
 //! - `histogram`: the distribution of every coefficient, fitted on tokens
 //! - `prediction`: expected coefficients, from earlier tokens of the same view
 //! - `table`: probabilities of quantized coefficients for a step
-//! - `rates`: measured bits and loss by token count and step
+//! - `rates`: measured loss by token count and step
 //! - `token_codec`: a model's codec: tokens to words and back
 //! - `file`: `codec.safetensors`
 //! - `fit`: a codec from training scenes: transform, distributions, and measured rates

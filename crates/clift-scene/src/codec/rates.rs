@@ -1,4 +1,4 @@
-//! Bits and loss of coded tokens, measured on renderings by token count and step when the codec is fitted.
+//! Loss of coded tokens, measured on renderings by token count and step when the codec is fitted.
 // C counts, K steps
 
 use clift_model::ModelError;
@@ -9,12 +9,8 @@ pub struct RateTable {
     pub shares: Vec<f64>,
     /// Ascending steps, `[K]`.
     pub steps: Vec<f64>,
-    /// Mean bits per token, `[C, K]`.
-    pub bits: Vec<f64>,
     /// Mean loss of PSNR in dB against rendering the same tokens without rounding, positive, `[C, K]`.
     pub loss: Vec<f64>,
-    /// Mean PSNR of every count without rounding in dB, `[C]`.
-    pub psnr: Vec<f64>,
 }
 
 /// Smallest loss in a table, in dB: logarithms are interpolated.
@@ -28,10 +24,9 @@ impl RateTable {
     pub fn checked(mut self) -> Result<Self, ModelError> {
         let (counts, steps) = (self.shares.len(), self.steps.len());
         let ascending = |values: &[f64]| values[0] > 0.0 && values.windows(2).all(|pair| pair[0] < pair[1]);
-        let sizes = [self.bits.len(), self.loss.len(), self.psnr.len()] == [counts * steps, counts * steps, counts];
-        let all = [&self.shares, &self.steps, &self.bits, &self.loss, &self.psnr];
-        let is_finite = all.iter().all(|values| values.iter().all(|value| value.is_finite()));
-        if counts == 0 || steps < 2 || !sizes || !is_finite || !ascending(&self.shares) || !ascending(&self.steps) {
+        let is_finite = [&self.shares, &self.steps, &self.loss].into_iter().flatten().all(|value| value.is_finite());
+        let is_table = counts > 0 && steps > 1 && self.loss.len() == counts * steps && is_finite;
+        if !is_table || !ascending(&self.shares) || !ascending(&self.steps) {
             let value = format!("{counts} counts and {steps} steps");
             return Err(ModelError::BadConfig { key: "rates", value, fix: "fit the codec again".into() });
         }
@@ -83,17 +78,11 @@ fn line(xs: &[f64], ys: &[f64], x: f64) -> f64 {
 pub(crate) mod tests {
     use super::*;
 
-    /// Half and all tokens: the loss grows with the square of the step, and the step takes a bit per octave.
+    /// Half and all tokens: the loss grows with the square of the step.
     pub(crate) fn rates() -> RateTable {
-        RateTable {
-            shares: vec![0.5, 1.0],
-            steps: vec![0.5, 1.0, 2.0],
-            bits: vec![20.0, 10.0, 0.0, 20.0, 10.0, 0.0],
-            loss: vec![0.01, 0.04, 0.16, 0.02, 0.08, 0.32],
-            psnr: vec![20.0, 21.0],
-        }
-        .checked()
-        .unwrap()
+        RateTable { shares: vec![0.5, 1.0], steps: vec![0.5, 1.0, 2.0], loss: vec![0.01, 0.04, 0.16, 0.02, 0.08, 0.32] }
+            .checked()
+            .unwrap()
     }
 
     #[test]
@@ -112,8 +101,8 @@ pub(crate) mod tests {
         assert!(noisy.loss.chunks(3).all(|loss| loss[0] > 0.0 && loss[0] < loss[1] && loss[1] < loss[2]), "{noisy:?}");
         for broken in [
             RateTable { steps: vec![1.0, 0.5, 2.0], ..rates() },
-            RateTable { psnr: vec![20.0], ..rates() },
-            RateTable { bits: vec![f64::NAN; 6], ..rates() },
+            RateTable { loss: vec![0.1; 5], ..rates() },
+            RateTable { loss: vec![f64::NAN; 6], ..rates() },
             RateTable { shares: vec![0.0, 1.0], ..rates() },
         ] {
             assert!(broken.checked().is_err());

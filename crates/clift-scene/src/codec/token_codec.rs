@@ -33,7 +33,7 @@ pub struct TokenCodec {
     pub prediction: Prediction,
     /// The distribution of every coefficient around its expected value.
     pub distributions: Distributions,
-    /// Measured bits and losses.
+    /// Measured losses.
     pub rates: RateTable,
     /// First 16 hexadecimal digits of the SHA-256 of the codec's file, which scene files contain.
     pub hash: String,
@@ -66,33 +66,21 @@ impl TokenCodec {
         Ok(rounded)
     }
 
-    /// Returns the bits of tokens `[S, D]` in a stream of their own.
-    pub(crate) fn stream_bits(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<f64, ModelError> {
-        let mut encoder = Encoder::default();
-        self.encode_levels(tokens, places, step, &mut encoder)?;
-        Ok(encoder.finish().len() as f64 * 32.0)
-    }
-
     /// Encodes tokens `[S, D]` and their places, in the order of ids.
     pub fn encode(&self, tokens: &[f32], places: Places<'_>, step: f32) -> Result<Vec<u32>, ModelError> {
         let mut ids = places.ids.to_vec();
         ids.sort_unstable();
         let mut encoder = Encoder::default();
         encode_ids(&mut encoder, &ids, places.grid.iter().product());
-        self.encode_levels(tokens, places, step, &mut encoder)?;
-        Ok(encoder.finish())
-    }
-
-    fn encode_levels(
-        &self,
-        tokens: &[f32],
-        places: Places<'_>,
-        step: f32,
-        encoder: &mut Encoder,
-    ) -> Result<(), ModelError> {
         let (levels, neighbours) = self.quantize(tokens, places, step)?;
-        self.for_each_deviation(&levels, &neighbours, step, |_, deviation, table| table.encode(deviation, encoder));
-        Ok(())
+        for (direction, levels) in levels.iter().enumerate() {
+            let tables = self.tables(direction, &neighbours, step);
+            for (level, &(class, nearest)) in levels.iter().zip(&neighbours) {
+                let expected = self.prediction.level(class, direction, nearest.map(|token| levels[token]));
+                tables[class].encode(level - expected, &mut encoder);
+            }
+        }
+        Ok(encoder.finish())
     }
 
     /// Decodes tokens and their ids on a `grid` of views, rows and columns. Words may be damaged or hostile: memory is
@@ -180,23 +168,6 @@ impl TokenCodec {
             of_direction.push(levels);
         }
         Ok((of_direction, neighbours))
-    }
-
-    /// Calls `code` with direction and class, deviation from the expected level, and table of every level.
-    fn for_each_deviation(
-        &self,
-        levels: &[Vec<i32>],
-        neighbours: &[(usize, [usize; 2])],
-        step: f32,
-        mut code: impl FnMut((usize, usize), i32, &Table),
-    ) {
-        for (direction, levels) in levels.iter().enumerate() {
-            let tables = self.tables(direction, neighbours, step);
-            for (level, &(class, nearest)) in levels.iter().zip(neighbours) {
-                let expected = self.prediction.level(class, direction, nearest.map(|token| levels[token]));
-                code((direction, class), level - expected, &tables[class]);
-            }
-        }
     }
 }
 

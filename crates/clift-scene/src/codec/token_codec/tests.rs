@@ -73,14 +73,20 @@ fn grid(count: usize) -> [usize; 3] {
 #[test]
 fn streams_take_the_bits_of_their_entropy() {
     let codec = small();
-    let unseen = tokens(32_000, DIM, 99);
+    let (unseen, ids) = (tokens(32_000, DIM, 99), ids(32_000));
+    let mut of_ids = Encoder::default();
+    encode_ids(&mut of_ids, &ids, grid(ids.len()).iter().product());
+    let of_ids = of_ids.finish().len();
     for step in [0.2, 1.0, 4.0] {
-        let stream = codec.stream_bits(&unseen, places(&ids(32_000)), step).unwrap();
-        let (levels, neighbours) = codec.quantize(&unseen, places(&ids(32_000)), step).unwrap();
+        let stream = (codec.encode(&unseen, places(&ids), step).unwrap().len() - of_ids) as f64 * 32.0;
+        let (levels, neighbours) = codec.quantize(&unseen, places(&ids), step).unwrap();
         let mut counts = BTreeMap::<_, BTreeMap<i32, f64>>::new();
-        codec.for_each_deviation(&levels, &neighbours, step, |known, deviation, _| {
-            *counts.entry(known).or_default().entry(deviation).or_default() += 1.0;
-        });
+        for (direction, levels) in levels.iter().enumerate() {
+            for (level, &(class, nearest)) in levels.iter().zip(&neighbours) {
+                let expected = codec.prediction.level(class, direction, nearest.map(|token| levels[token]));
+                *counts.entry((direction, class)).or_default().entry(level - expected).or_default() += 1.0;
+            }
+        }
         let bits = |counts: &BTreeMap<i32, f64>| {
             let total: f64 = counts.values().sum();
             counts.values().map(|count| count * (total / count).log2()).sum::<f64>()
@@ -172,7 +178,7 @@ fn codecs_survive_their_file_and_damage_is_found() {
         (text("clift-codec", "clift-scene"), "format \"clift-scene\", expected"),
         (text("\"version\":\"2\"", "\"version\":\"3\""), "version 3, this clift reads version 2"),
         (text("\\\"dim\\\":8", "\\\"dim\\\":4"), "`mean` is F32 [8], expected F32 [4]"),
-        (text("rate_psnr", "rate_psnt"), "no tensor `rate_psnr`"),
+        (text("rate_loss", "rate_lost"), "no tensor `rate_loss`"),
         (b"{}".to_vec(), "fit it again with `clift codec`"),
     ] {
         std::fs::write(&path, bytes).unwrap();
