@@ -19,8 +19,6 @@ pub struct Sweep {
     pub model: ModelConfig,
     /// LPIPS; `None` without its weights.
     pub lpips: Option<Lpips>,
-    /// Whether the device is a CPU, where the peak memory of the process includes the tensors.
-    pub is_cpu: bool,
     /// Whether the context views are rendered too, to find those that come out as fog.
     pub checks_contexts: bool,
     /// Least number of timed views per key: views of the first scenes are rendered again to reach it. 0 renders every view once.

@@ -92,14 +92,13 @@ impl Config {
 
     /// Returns the settings of an evaluation by `eval`, without LPIPS.
     pub(crate) fn sweep(&self, eval: EvalConfig) -> Sweep {
-        let Self { seed, clusters, model, device, .. } = self;
+        let Self { seed, clusters, model, .. } = self;
         Sweep {
             eval,
             model_path: self.run_dir.display().to_string(),
             kmeans: clusters.kmeans.clone(),
             model: model.clone(),
             lpips: None,
-            is_cpu: device.is_cpu(),
             checks_contexts: false,
             min_timed_views: 0,
             seed: derive_seed(*seed, "eval"),
