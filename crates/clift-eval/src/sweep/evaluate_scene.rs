@@ -201,8 +201,6 @@ impl TargetRenderer<'_> {
         metrics: &mut EvalResults,
     ) -> Result<(), EvalError> {
         if let Entry::Vacant(cost) = metrics.costs.entry(job.key) {
-            // Queued work must not count as rendering.
-            job.tokens.values.device().sync().map_err(ModelError::device)?;
             self.render_view(&job, 0)?;
             let target = &self.clip.target;
             let macs = job.model.config.render_macs(target.height, target.width, job.key.num_render_tokens)?;
