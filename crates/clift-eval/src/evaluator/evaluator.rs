@@ -26,9 +26,6 @@ use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
 use crate::sweep::sweep::Sweep;
 
-/// Smallest number of timed views of a point: quartiles of fewer mean little.
-const MIN_TIMED_VIEWS: usize = 20;
-
 /// The scenes and views of an evaluation, and the settings of every scene.
 pub struct Evaluator {
     /// The settings of every scene.
@@ -96,7 +93,6 @@ impl Evaluator {
         let sweep = Sweep {
             eval: EvalConfig { methods, formats, ..self.sweep.eval.clone() },
             lpips: lpips.clone().ok(),
-            min_timed_views: MIN_TIMED_VIEWS,
             ..self.sweep.clone()
         };
         progress.done(0, self.items.len());

@@ -1,10 +1,8 @@
 //! The sweep of one scene: encoded once, rendered by every method at every token count.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::time::Instant;
 
-use clift_core::median;
 use clift_data::Clip;
 use clift_model::{Cameras, FlopConvention, ModelError, Tokens, TrainedModel, Views};
 use clift_scene::TokenCoding;
@@ -20,9 +18,6 @@ use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, ba
 use crate::sweep::sweep::Sweep;
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
-
-/// Largest time of the repeated renderings of one scene, in seconds.
-const MAX_REPETITION_S: f64 = 5.0;
 
 /// Renders and scores the target views of one scene, and adds their metrics to `metrics`.
 ///
@@ -60,9 +55,7 @@ pub(crate) fn evaluate_scene(
         add_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
     }
     add_whole_jobs(models, &context, &renderer, &kept_views, &mut jobs, metrics)?;
-    let num_timed =
-        jobs.first().and_then(|job| metrics.of(job.key)).map_or(0, |scenes| scenes.values().map(BTreeMap::len).sum());
-    for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
+    for (job, rendering) in jobs.iter().zip(renderer.render(&jobs)?) {
         record(clip, &rendering, metrics);
         if !job.kept_views.is_empty() {
             renderings.push(rendering);
@@ -219,46 +212,25 @@ impl TargetRenderer<'_> {
     ///
     /// The measured time is from tokens on the device to pixels on the host. Views share no work, so the times of any two
     /// keys are comparable. A viewer that keeps the keys and values of a scene's tokens between frames is faster. The jobs
-    /// take turns at every view, in alternating order, so that a change in the load of the machine meets all of them. While
-    /// the evaluation has fewer than `min_timed_views` timed views, `num_timed` before this scene, the views are rendered
-    /// again, and the time of a view is the median.
-    fn render(&self, jobs: &[RenderJob], num_timed: usize) -> Result<Vec<ScoredViews>, EvalError> {
-        let num_views = self.clip.target.num_views();
+    /// take turns at every view, in alternating order, so that a change in the load of the machine meets all of them.
+    fn render(&self, jobs: &[RenderJob]) -> Result<Vec<ScoredViews>, EvalError> {
         let mut scored: Vec<ScoredViews> = jobs.iter().map(|job| ScoredViews::new(job.key)).collect();
-        let mut seconds = vec![vec![Vec::new(); jobs.len()]; num_views];
         if let Some(job) = jobs.first() {
+            // Queued work must not count as rendering.
             job.tokens.values.device().sync().map_err(ModelError::device)?;
         }
-        let missing = self.sweep.min_timed_views.saturating_sub(num_timed);
-        let num_rounds = missing.div_ceil(num_views.max(1)).max(1);
-        let started = Instant::now();
-        let mut first_round_s = 0.0;
-        for round in 0..num_rounds {
-            if round > 0 && started.elapsed().as_secs_f64() > first_round_s + MAX_REPETITION_S {
-                break;
+        for view in 0..self.clip.target.num_views() {
+            let mut order: Vec<usize> = (0..jobs.len()).collect();
+            if view % 2 == 1 {
+                order.reverse();
             }
-            for (view, times) in seconds.iter_mut().enumerate() {
-                let mut order: Vec<usize> = (0..jobs.len()).collect();
-                if (round + view) % 2 == 1 {
-                    order.reverse();
-                }
-                for i in order {
-                    let now = Instant::now();
-                    let pixels = self.render_view(&jobs[i], view)?;
-                    times[i].push(now.elapsed().as_secs_f64());
-                    if round == 0 {
-                        scored[i].add(view, pixels, self.scorer, jobs[i].kept_views)?;
-                    }
-                }
-            }
-            if round == 0 {
-                first_round_s = started.elapsed().as_secs_f64();
-            }
-        }
-        for (i, job) in jobs.iter().enumerate() {
-            for (&view, measured) in &mut scored[i].metrics {
-                measured.render_s = Some(median(&seconds[view][i]));
-                measured.select_s = job.selected.as_ref().map(|selected| selected[view].select_s);
+            for i in order {
+                let started = Instant::now();
+                let pixels = self.render_view(&jobs[i], view)?;
+                let render_s = started.elapsed().as_secs_f64();
+                let measured = scored[i].add(view, pixels, self.scorer, jobs[i].kept_views)?;
+                measured.render_s = Some(render_s);
+                measured.select_s = jobs[i].selected.as_ref().map(|selected| selected[view].select_s);
             }
         }
         Ok(scored)

@@ -31,13 +31,12 @@ impl ScoredViews {
         pixels: Vec<f32>,
         scorer: &ViewScorer,
         kept_views: &[usize],
-    ) -> Result<(), EvalError> {
+    ) -> Result<&mut ViewMetrics, EvalError> {
         let metrics = scorer.measure(&pixels, view)?;
         if kept_views.contains(&view) {
             self.images.insert(view, pixels);
         }
-        self.metrics.insert(view, metrics);
-        Ok(())
+        Ok(self.metrics.entry(view).or_insert(metrics))
     }
 }
 

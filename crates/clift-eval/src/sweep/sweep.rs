@@ -21,8 +21,6 @@ pub struct Sweep {
     pub lpips: Option<Lpips>,
     /// Whether the context views are rendered too, to find those that come out as fog.
     pub checks_contexts: bool,
-    /// Least number of timed views per key: views of the first scenes are rendered again to reach it. 0 renders every view once.
-    pub min_timed_views: usize,
     /// Seed of K-means and of random tokens. Every scene derives a seed of its own from this seed and its key.
     pub seed: u64,
 }

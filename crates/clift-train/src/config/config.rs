@@ -100,7 +100,6 @@ impl Config {
             model: model.clone(),
             lpips: None,
             checks_contexts: false,
-            min_timed_views: 0,
             seed: derive_seed(*seed, "eval"),
         }
     }
