@@ -36,11 +36,10 @@ impl Evaluation {
     }
 }
 
-/// The differences of one key, which `a` and `b` both name.
+/// The differences of one key.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairedRow {
-    pub a: EvalKey,
-    pub b: EvalKey,
+    pub key: EvalKey,
     pub num_scenes: usize,
     pub num_views: usize,
     /// Views that the other evaluation does not have: ignored.
@@ -110,18 +109,8 @@ impl PairedRow {
         let num_other = |views: &SceneViews| views.values().map(BTreeMap::len).sum::<usize>() - num_views;
         let [psnr, ssim, lpips_vgg, sharpness] = METRICS.map(|metric| MetricDifference::new(&common, metric));
         let (num_only_a, num_only_b) = (num_other(a), num_other(b));
-        Self {
-            a: key,
-            b: key,
-            num_scenes: common.len(),
-            num_views,
-            num_only_a,
-            num_only_b,
-            psnr,
-            ssim,
-            lpips_vgg,
-            sharpness,
-        }
+        let num_scenes = common.len();
+        Self { key, num_scenes, num_views, num_only_a, num_only_b, psnr, ssim, lpips_vgg, sharpness }
     }
 }
 
@@ -158,7 +147,7 @@ impl fmt::Display for Comparison {
 
 fn cells(pair: &PairedRow) -> [String; 7] {
     [
-        pair.a.to_string(),
+        pair.key.to_string(),
         pair.num_scenes.to_string(),
         pair.psnr.map_or_else(|| "-".into(), |difference| format!("{:.2}", difference.a)),
         interval(pair.psnr, 3),
