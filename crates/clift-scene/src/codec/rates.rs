@@ -40,9 +40,15 @@ impl RateTable {
         Ok(self)
     }
 
+    /// Interpolates in the logarithms; beyond the steps the line goes on, beyond the shares it is constant.
     pub fn loss(&self, share: f64, step: f64) -> f64 {
-        let logs: Vec<f64> = self.loss.iter().map(|loss| loss.ln()).collect();
-        self.at(&logs, share, step).exp()
+        let logs = |values: &[f64]| values.iter().map(|value| value.ln()).collect::<Vec<f64>>();
+        let (shares, steps, losses) = (logs(&self.shares), logs(&self.steps), logs(&self.loss));
+        let rows: Vec<f64> = losses.chunks_exact(steps.len()).map(|row| line(&steps, row, step.ln())).collect();
+        if rows.len() == 1 {
+            return rows[0].exp();
+        }
+        line(&shares, &rows, share.ln().clamp(shares[0], shares[shares.len() - 1])).exp()
     }
 
     /// Returns the largest step with at most `loss_db` of expected loss.
@@ -53,17 +59,6 @@ impl RateTable {
             *(if self.loss(share, middle) <= loss_db { &mut low } else { &mut high }) = middle;
         }
         low
-    }
-
-    /// Interpolates in the logarithms of share and step; beyond the steps the line goes on, beyond the shares it is constant.
-    fn at(&self, values: &[f64], share: f64, step: f64) -> f64 {
-        let steps: Vec<f64> = self.steps.iter().map(|step| step.ln()).collect();
-        let rows: Vec<f64> = values.chunks_exact(steps.len()).map(|row| line(&steps, row, step.ln())).collect();
-        if rows.len() == 1 {
-            return rows[0];
-        }
-        let shares: Vec<f64> = self.shares.iter().map(|share| share.ln()).collect();
-        line(&shares, &rows, share.ln().clamp(shares[0], shares[shares.len() - 1]))
     }
 }
 

@@ -16,8 +16,6 @@ pub struct EncodedScene {
     pub scene: Scene,
     /// Images and cameras of the context views.
     pub context: ClipViews,
-    /// Number of tokens before clustering.
-    pub num_lift_tokens: usize,
     /// Clusters of the tokens.
     pub clusters: SceneClusters,
 }
@@ -73,7 +71,7 @@ pub fn encode(
         token_ids,
         tokens,
     };
-    Ok(EncodedScene { scene, context, num_lift_tokens: clusters.assignment().len(), clusters })
+    Ok(EncodedScene { scene, context, clusters })
 }
 
 /// Returns the share of all tokens that is stored by default: a quarter, but of many groups an eighth at least and `MOST` tokens

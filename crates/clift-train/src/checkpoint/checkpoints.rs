@@ -165,10 +165,6 @@ impl Checkpoints {
         Ok(progress)
     }
 
-    pub(crate) fn newest(&self) -> Result<Option<PathBuf>, TrainError> {
-        Ok(self.newest_step()?.map(|step| self.path_of(step)))
-    }
-
     pub(crate) fn newest_step(&self) -> Result<Option<u64>, TrainError> {
         Ok(self.steps()?.pop())
     }

@@ -90,11 +90,11 @@ impl Config {
         weights.into_iter().chain([&data.root, &eval.index]).flatten().cloned().collect()
     }
 
-    /// Returns the settings of an evaluation by `eval`, without LPIPS.
-    pub(crate) fn sweep(&self, eval: EvalConfig) -> Sweep {
-        let Self { seed, clusters, model, .. } = self;
+    /// Returns the settings of an evaluation, without LPIPS.
+    pub(crate) fn sweep(&self) -> Sweep {
+        let Self { seed, clusters, model, eval, .. } = self;
         Sweep {
-            eval,
+            eval: eval.clone(),
             model_path: self.run_dir.display().to_string(),
             kmeans: clusters.kmeans.clone(),
             model: model.clone(),

@@ -67,7 +67,7 @@ pub fn evaluate_model(
         frames.hold_out = config.data.hold_out;
     }
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
-    let mut validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
+    let mut validation = Validation::new(&config, reader, frames, &device, sink)?;
     validation.evaluator.sweep.checks_contexts = true;
     validation.evaluate(&models, folder, stop, sink)
 }

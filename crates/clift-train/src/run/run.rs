@@ -240,7 +240,7 @@ impl Run {
         let opened = open_dataset(data, split, &mut progress)?;
         let frames = EvalFrames::new(&opened, split, data.hold_out, self.is_training_data);
         let reader = self.reader(opened, split, sink)?;
-        Validation::new(&self.config, self.config.eval.clone(), reader, frames, &self.device, sink)
+        Validation::new(&self.config, reader, frames, &self.device, sink)
     }
 
     fn parts(&self, stage: Stage) -> BatchParts {

@@ -345,7 +345,8 @@ impl TrainLoop<'_> {
     }
 
     fn newest_checkpoint(&self) -> String {
-        self.checkpoints.newest().ok().flatten().map_or("none".into(), |path| path.display().to_string())
+        let newest = self.checkpoints.newest_step().ok().flatten();
+        newest.map_or("none".into(), |step| self.checkpoints.path_of(step).display().to_string())
     }
 
     /// Adds the last step and the newest checkpoint to an error.

@@ -27,10 +27,9 @@ pub struct Validation<'a> {
 }
 
 impl<'a> Validation<'a> {
-    /// Chooses the scenes and views among the `frames` of `reader` by `eval`, for an evaluation on `device`.
+    /// Chooses the scenes and views among the `frames` of `reader`, for an evaluation on `device`.
     pub fn new(
         config: &'a Config,
-        eval: EvalConfig,
         reader: ClipReader,
         frames: EvalFrames,
         device: &Device,
@@ -44,7 +43,7 @@ impl<'a> Validation<'a> {
             device: config.device.to_string(),
             command: std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect::<Vec<_>>().join(" "),
         };
-        let evaluator = Evaluator::new(config.sweep(eval), description, reader, frames, device)?;
+        let evaluator = Evaluator::new(config.sweep(), description, reader, frames, device)?;
         if !evaluator.skip_report.skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report)));
         }

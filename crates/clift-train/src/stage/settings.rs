@@ -3,7 +3,7 @@
 use burn::module::Module;
 use clift_model::{Network, Part};
 
-use crate::config::config::{Config, OptimizerConfig, Stage1Config};
+use crate::config::config::{Config, OptimizerConfig};
 use crate::events::Stage;
 
 /// Settings of a stage that makes updates.
@@ -53,13 +53,6 @@ impl StageSettings<'_> {
 /// Makes up for the rounding of a share of steps: 0.29 * 100 is below 29.
 const ROUNDING: f64 = 1e-6;
 
-impl Stage1Config {
-    /// Returns how many of `steps` steps of stage 1 have images of half the width and height: the share, rounded down.
-    pub(crate) fn half_resolution_steps(&self, steps: u64) -> u64 {
-        (self.half_resolution * steps as f64 + ROUNDING) as u64
-    }
-}
-
 impl Config {
     /// Returns the settings of a stage.
     pub fn stage(&self, stage: Stage) -> StageSettings<'_> {
@@ -67,7 +60,7 @@ impl Config {
         let settings = StageSettings {
             stage,
             steps: stage1.steps,
-            half_resolution_steps: stage1.half_resolution_steps(stage1.steps),
+            half_resolution_steps: (stage1.half_resolution * stage1.steps as f64 + ROUNDING) as u64,
             batch_size: stage1.batch_size,
             accumulate: stage1.accumulate,
             optimizer: &stage1.optimizer,

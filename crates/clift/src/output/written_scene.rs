@@ -68,8 +68,8 @@ pub fn print_scene(written: &WrittenScene, out: &Path, model: &str, is_capture: 
 }
 
 fn describe(written: &WrittenScene, path: &Path) -> String {
-    let EncodedScene { scene, num_lift_tokens, .. } = &written.encoded;
-    let num_tokens = scene.num_tokens();
+    let EncodedScene { scene, clusters, .. } = &written.encoded;
+    let (num_tokens, num_lift_tokens) = (scene.num_tokens(), clusters.assignment().len());
     let mut frames: Vec<String> =
         scene.context_frames.iter().map(|&frame| written.frame_name(frame as usize)).collect();
     if frames.len() > MAX_LISTED {
