@@ -195,7 +195,8 @@ pub(crate) fn split_groups(sizes: &[u32], members: &[u32]) -> Result<Vec<Vec<u32
 }
 
 /// Returns the size of a scene file in bytes: `8 + 2048 + 136 + 164 V + 140 G + 4 M + S (28 + D b)` for V context views, G
-/// groups of M members and S tokens of width D with b bytes per value. Learned tokens have neither ray nor patch, 28 bytes less.
+/// groups of M members and S tokens of width D with b bytes per value. Learned tokens have neither ray nor patch, 28 bytes
+/// less.
 pub fn scene_file_bytes(
     model: &ModelConfig,
     num_tokens: usize,
