@@ -115,7 +115,7 @@ impl RunScenes {
         };
         let EncodedScene { mut scene, context: context_views, clusters, .. } =
             encode(&self.model, &self.reader, *index, &options)?;
-        scene.tokens = RUN_FORMAT.round(&scene.tokens, scene.model.dim)?;
+        scene.tokens = RUN_FORMAT.round(&scene.tokens)?;
         // The key comes from data: as a file name it must not lead to another folder.
         let file = format!("{}.clift", file_name(&scene.key));
         let mut scene_args = vec!["--scene".to_owned(), scene.key.clone()];
