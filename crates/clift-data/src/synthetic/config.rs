@@ -17,7 +17,7 @@ pub enum Look {
     Rooms,
     /// Scenes with the statistics of photos: interiors, places outdoors, things; fields of view from 40 to 100 degrees.
     Real,
-    /// Scenes of `real`, partly with frames that differ as photos do, and rooms.
+    /// Those of `real` with frames that differ as photos do; every eighth scene is one of `rooms`.
     Mixed,
 }
 
@@ -26,9 +26,8 @@ pub enum Look {
 #[serde(deny_unknown_fields, default)]
 pub struct SyntheticConfig {
     /// Kind of scenes: `"rooms"`, or `"real"`, which has the statistics of photos and samples all that the keys from
-    /// `fov_deg` on set for rooms, or `"mixed"`: every eighth scene is one of `rooms`, every second one of
-    /// `real`, the others are of `real` with arcs up to half a circle and frames that differ in roll (up to 30 degrees), focal
-    /// length (25 %) and exposure (0.8 stops).
+    /// `fov_deg` on set for rooms, or `"mixed"`: every eighth scene is one of `rooms`, the others are of `real` with arcs up
+    /// to half a circle and frames that differ in roll (up to 30 degrees), focal length (25 %) and exposure (0.8 stops).
     pub look: Look,
     /// Seed of all scenes. Different seeds share no scene.
     pub seed: u64,
