@@ -14,7 +14,7 @@ const CRATES: [Crate; 11] = [
         "",
         "simd primitives attention bf16_values cluster_attention gelu head_transform layer_norm linear matmul_bf16 rms_norm",
     ),
-    ("clift-cube", "", "adapter buffers rows products attention"),
+    ("clift-cube", "", "adapter ledger buffers rows products attention"),
     (
         "clift-model",
         "clift-core clift-cube clift-kernels",
@@ -41,7 +41,7 @@ const CRATES: [Crate; 11] = [
     (
         "clift-bench",
         "clift-core clift-kernels clift-model clift-data clift-scene clift-eval clift-train",
-        "cases runner doctor",
+        "cases runner ledger doctor",
     ),
     (
         "clift-view",

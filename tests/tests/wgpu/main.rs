@@ -135,7 +135,8 @@ fn scenes_are_encoded_and_rendered_as_on_the_cpu() {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     };
     for device in ["flex", "wgpu"] {
-        let encode = "encode run --scene synthetic-0-test-00000 --stored-tokens 4 --format f32 --set device=";
+        let encode =
+            "encode run --scene synthetic-0-test-00000 --stored-tokens 4 --format f32 --precision f32 --set device=";
         run(&format!("{encode}{device} -o {device}.clift"));
         run(&format!(
             "render flex.clift --path orbit --frames 2 --render 3 --precision f32 --device {device} -o {device}"

@@ -3,8 +3,7 @@
 
 use std::mem::MaybeUninit;
 
-use crate::primitives::packing::has_matrix_tiles;
-use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile};
+use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile, has_matrix_tiles};
 
 /// Lanes of A that are laid out for matrix tiles at a time.
 const MATRIX_BLOCK: usize = 4 * MATRIX_LANES;

@@ -1,12 +1,6 @@
 //! Operands of matrix products, laid out for the register tile.
 
-use crate::simd::vector::{MATRIX_LANES, MAX_LANES, Operands, Simd};
-
-/// Whether [`multiply`](crate::primitives::matmul::multiply) runs matrix tiles.
-#[inline(always)]
-pub(crate) fn has_matrix_tiles<S: Simd, O: Operands>() -> bool {
-    S::HAS_MATRIX_TILES && O::PER_LANE == 2
-}
+use crate::simd::vector::{MATRIX_LANES, MAX_LANES, Operands, Simd, has_matrix_tiles};
 
 /// Returns the lanes that `count` values along the inner dimension take, with the zeros at their end.
 #[inline(always)]

@@ -3,9 +3,8 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use crate::primitives::packing::has_matrix_tiles;
 use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
-use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile};
+use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile, has_matrix_tiles};
 
 /// Independent sums, enough to hide the latency of a multiply-add.
 const SUMS: usize = 12;

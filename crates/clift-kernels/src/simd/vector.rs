@@ -167,6 +167,12 @@ fn array<S: Simd>(simd: S, vector: S::V) -> [f32; MAX_LANES] {
     array
 }
 
+/// Whether products of these operands run on matrix tiles.
+#[inline(always)]
+pub(crate) fn has_matrix_tiles<S: Simd, O: Operands>() -> bool {
+    S::HAS_MATRIX_TILES && O::PER_LANE == 2
+}
+
 /// Values in the lanes of the operands of a matrix product.
 pub trait Operands: Copy + Send + Sync + 'static {
     /// Values per lane, neighbours along the inner dimension.

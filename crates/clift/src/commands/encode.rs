@@ -71,7 +71,7 @@ pub struct EncodeArgs {
     /// Fit the tokens to the photos of a capture, in this many steps, such as 30
     ///
     /// Gradient descent through the renderer, for every group of neighbours: views between the photos are nearer to the truth,
-    /// in about fifteen times the time.
+    /// in about twelve times the time.
     #[arg(long, value_name = "STEPS", default_value_t = 0, hide_default_value = true)]
     pub refine: usize,
     /// Operands of matrix products: f32, bf16 or f16 [default: bf16 if the CPU has its instructions, else f32]
