@@ -300,7 +300,7 @@ impl Place {
         let mut summary = self.json(&format!("{run}/eval/summary.json"));
         for point in summary["points"].as_array_mut().expect("a list") {
             let point = point.as_object_mut().expect("an object");
-            point.retain(|key, _| !key.ends_with("_s") && key != "pareto_time");
+            point.retain(|key, _| !key.ends_with("_s") && key != "peak_bytes" && key != "pareto_time");
         }
         summary
     }

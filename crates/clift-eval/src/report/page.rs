@@ -83,7 +83,7 @@ impl Report {
                         div.figures { @for plot in plots(summary) { (plot.to_html()) } }
                         p.note { "Error bars are one standard error over scenes. Hover over a mark to read its values." }
                         h2 { "All points" }
-                        (table(&HEADER, summary.rows().iter().map(<[String; 15]>::as_slice)))
+                        (table(&HEADER, summary.rows().iter().map(<[String; 16]>::as_slice)))
                         @for note in summary.notes() { p.note { (text(&note)) } }
                         p.note { (POINTS_NOTE) }
                         @if !summary.differences.is_empty() {
@@ -198,6 +198,7 @@ mod tests {
                     results.add_scene_bytes(key, 1000 * key.num_storage_tokens as u64);
                 }
             }
+            results.add_coded_bytes(key(Method::Clift, 8, 8), 777);
         }
         results.note_not_measured("lpips_vgg", "no <weights>".into());
         results
@@ -231,7 +232,8 @@ mod tests {
         for part in [
             "Quality against stored tokens",
             "Quality against the size of a scene",
-            "<td>8.0</td>",
+            "clift, coded: the default of clift encode",
+            "<td>0.8</td>",
             "Quality against rendered tokens",
             "Quality against time per frame",
             "2 of 3 scenes were evaluated",

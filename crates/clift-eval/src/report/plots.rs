@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clift_scene::TokenCoding;
+use clift_scene::{CodedLoss, TokenCoding};
 
 use crate::config::method::Method;
 use crate::report::plot::{Mark, Plot, Series};
@@ -28,8 +28,18 @@ pub fn plots(summary: &Summary) -> Vec<Plot> {
         vec![plot("Quality against stored tokens", "stored tokens", series(summary, true, whole(stored), |_| false))];
     if has(|point| point.key.is_whole() && point.cost.scene_bytes.is_some()) {
         let kb = |point: &SummaryPoint| point.cost.scene_bytes.map(|bytes| bytes as f64 / 1e3);
-        let lines = series(summary, true, whole(kb), |point| point.pareto_bytes);
-        let note = "Rings: the Pareto front.".into();
+        let mut lines = series(summary, true, whole(kb), |point| point.pareto_bytes);
+        let coded = coded_series(summary);
+        let note = if coded.is_some() {
+            format!(
+                "Sizes in the formats of the evaluation, and of the default format of clift encode, coded tokens, at the \
+                 PSNR of plain ones: coding lost at most {} dB where the codec was fitted. Rings: the Pareto front.",
+                CodedLoss::default().db()
+            )
+        } else {
+            "Sizes in the formats of the evaluation. Rings: the Pareto front.".into()
+        };
+        lines.extend(coded);
         plots.push(Plot { note, ..plot("Quality against the size of a scene", "scene, kB", lines) });
     }
     // Of one network, values are tokens and work is nearly linear in them.
@@ -82,6 +92,19 @@ fn series(
         Series { name, look: [colour, of_format.unwrap_or(colour)], is_joined, marks }
     };
     lines.into_iter().map(line).collect()
+}
+
+/// Returns the sizes in the default format of `clift encode`, where the evaluation has not measured this format.
+fn coded_series(summary: &Summary) -> Option<Series> {
+    let default = Some(TokenCoding::Coded(CodedLoss::default()));
+    if summary.points.iter().any(|point| point.key.tokens == default) {
+        return None;
+    }
+    let points = summary.best_points().filter(|point| point.key.is_whole());
+    let marks: Vec<Mark> =
+        points.filter_map(|point| mark(point, point.cost.coded_bytes? as f64 / 1e3, false)).collect();
+    let name = "clift, coded: the default of clift encode".into();
+    (!marks.is_empty()).then_some(Series { name, look: [7, 4], is_joined: true, marks })
 }
 
 /// Returns a series per number of stored tokens of the main method, over rendered tokens.

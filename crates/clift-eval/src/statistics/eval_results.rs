@@ -54,8 +54,8 @@ pub struct EvalResults {
     views: BTreeMap<EvalKey, SceneViews>,
     /// Cost of every key of which a warm-up view was rendered.
     pub(crate) costs: BTreeMap<EvalKey, Cost>,
-    /// Sizes of the scene files of every key.
-    bytes: BTreeMap<EvalKey, Vec<f64>>,
+    /// Sizes of the scene files of every key: in its format, and in the default format of `clift encode`.
+    bytes: BTreeMap<EvalKey, [Vec<u64>; 2]>,
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) facts: Facts,
     /// Scene and frame of the targets that are also contexts.
@@ -91,14 +91,22 @@ impl EvalResults {
 
     /// Records the size of a scene file.
     pub(crate) fn add_scene_bytes(&mut self, key: EvalKey, bytes: u64) {
-        self.bytes.entry(key).or_default().push(bytes as f64);
+        self.bytes.entry(key).or_default()[0].push(bytes);
     }
 
-    /// Returns the cost of a key, with the mean size over scenes.
+    /// Records the size of a scene file with the default coding.
+    pub(crate) fn add_coded_bytes(&mut self, key: EvalKey, bytes: u64) {
+        self.bytes.entry(key).or_default()[1].push(bytes);
+    }
+
+    /// Returns the cost of a key, with the mean sizes over scenes.
     pub(crate) fn cost(&self, key: EvalKey) -> Cost {
         let mut cost = self.costs.get(&key).copied().unwrap_or_default();
         if let Some(sizes) = self.bytes.get(&key) {
-            cost.scene_bytes = mean(sizes).map(|mean| mean.round() as u64);
+            [cost.scene_bytes, cost.coded_bytes] = sizes.each_ref().map(|sizes| {
+                let sizes: Vec<f64> = sizes.iter().map(|bytes| *bytes as f64).collect();
+                mean(&sizes).map(|mean| mean.round() as u64)
+            });
         }
         cost
     }

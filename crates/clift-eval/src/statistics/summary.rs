@@ -302,7 +302,7 @@ mod tests {
         views.add_context_check(ContextCheck { num_views: 2, num_fog: 1 });
         views.facts.training_scenes.insert("a".into());
         views.masked.insert("a".into(), [(0, 0.25)].into());
-        let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000) };
+        let cost = Cost { gflops: Some(2.5), scene_values: Some(4096), scene_bytes: Some(99_000), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
         views.note_not_measured("lpips_vgg", "no weights".into());
@@ -317,7 +317,7 @@ mod tests {
             "sharpness": 0.75, "sharpness_per_view": 0.75,
             "render_s": null, "render_median_s": null, "render_p95_s": null,
             "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
-            "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000,
+            "gflops": 2.5, "scene_values": 4096, "scene_bytes": 99_000, "coded_bytes": null, "peak_bytes": null,
             "pareto_time": false, "pareto_bytes": true
         });
         let expected = serde_json::json!({

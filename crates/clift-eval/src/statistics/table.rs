@@ -3,12 +3,13 @@
 use std::fmt;
 
 use clift_data::plural;
+use clift_scene::CodedLoss;
 
 use crate::config::method::Method;
 use crate::statistics::summary::{Quality, Summary, SummaryPoint};
 use crate::statistics::text_table::table;
 
-pub const HEADER: [&str; 15] = [
+pub const HEADER: [&str; 16] = [
     "method",
     "stored",
     "rendered",
@@ -23,6 +24,7 @@ pub const HEADER: [&str; 15] = [
     "half ms",
     "GMAC",
     "scene kB",
+    "coded kB",
     "",
 ];
 
@@ -47,6 +49,13 @@ impl Summary {
                 "t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes"
                     .into(),
             );
+        }
+        if self.points.iter().any(|point| point.cost.coded_bytes.is_some()) {
+            notes.push(format!(
+                "scene kB: a scene file in the format of the row; coded kB: in the default format of `clift encode`, coded \
+                 tokens, which lost at most {} dB where the codec was fitted",
+                CodedLoss::default().db()
+            ));
         }
         notes.extend(self.facts.selection.map(|selection| format!("rendered tokens were selected by {selection}")));
         let not_measured = self.facts.not_measured.iter();
@@ -94,7 +103,7 @@ fn baseline_cells(method: Method, quality: Quality, num_views: usize) -> [String
     (cells[4], cells[6], cells[7], cells[8]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3), cell(sharpness, 2));
     let has_copies = num_identical_views > 0;
     let copies = has_copies.then(|| format!("{num_identical_views} of {num_views} views identical to the target"));
-    cells[14] = copies.unwrap_or_default();
+    cells[15] = copies.unwrap_or_default();
     cells
 }
 
@@ -118,6 +127,7 @@ fn point_cells(point: &SummaryPoint) -> [String; HEADER.len()] {
         quartiles.unwrap_or_else(|| cell(None, 0)),
         cell(point.cost.gflops, if point.cost.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
         kb(point.cost.scene_bytes),
+        kb(point.cost.coded_bytes),
         [if point.pareto_time { "t" } else { "" }, if point.pareto_bytes { "b" } else { "" }].concat(),
     ]
 }
@@ -147,19 +157,21 @@ mod tests {
             views.add(scene, 0, CLIFT, measured);
         }
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5)));
-        let cost = Cost { gflops: Some(45.23), scene_bytes: Some(99_000), ..Cost::default() };
+        let cost = Cost { gflops: Some(45.23), scene_bytes: Some(99_000), coded_bytes: Some(9_950), ..Cost::default() };
         views.costs.insert(CLIFT, cost);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
 
-method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  sharp  render ms  frame ms  half ms     GMAC  scene kB
-nearest_view  -       -         -       18.00    -      0.500  -      -      -          -         -           -     -
-mean_image    -       -         -       -        -      -      -      -      -          -         -           -     -
-clift         64      32        f16     20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  99.0      tb
+method        stored  rendered  format  PSNR dB  +- dB  SSIM   LPIPS  sharp  render ms  frame ms  half ms     GMAC  scene kB  coded kB
+nearest_view  -       -         -       18.00    -      0.500  -      -      -          -         -           -     -         -
+mean_image    -       -         -       -        -      -      -      -      -          -         -           -     -         -
+clift         64      32        f16     20.50    0.50   0.205  -      0.82   1.5        11.5      11.2..11.8  45.2  99.0      9.9       tb
 
 frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
 t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes
+scene kB: a scene file in the format of the row; coded kB: in the default format of `clift encode`, coded tokens, \
+which lost at most 0.02 dB where the codec was fitted
 lpips_vgg is not measured: no weights
 ";
         assert_eq!(Summary::new(&views).to_string(), expected);

@@ -107,6 +107,10 @@ pub struct Cost {
     /// Values of the stored tokens: tokens times their width.
     pub scene_values: Option<u64>,
     pub scene_bytes: Option<u64>,
+    /// Mean bytes of a scene file as `clift encode` writes it by default: of condensed tokens with a codec.
+    pub coded_bytes: Option<u64>,
+    /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
+    pub peak_bytes: Option<u64>,
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use clift_data::Clip;
 use clift_model::{Cameras, FlopConvention, ModelError, Tokens, TrainedModel, Views};
-use clift_scene::TokenCoding;
+use clift_scene::{CodedLoss, TokenCoding};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
@@ -18,6 +18,7 @@ use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, ba
 use crate::sweep::sweep::Sweep;
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
+use crate::system::memory;
 
 /// Renders and scores the target views of one scene, and adds their metrics to `metrics`.
 ///
@@ -88,9 +89,10 @@ fn add_jobs<'a>(
         let count = count.of(lift.tokens.dims()[1])?;
         for &method in sweep.eval.methods.iter().filter(|method| method.network().is_none()) {
             let lift = own.iter().find(|(of, _)| *of == method).map_or(&lift, |(_, lift)| lift);
+            let compressed =
+                |coding, path: &str| CompressedTokens::new(method, models, (lift, count), coding, (clip, path));
             for (i, coding) in sweep.eval.formats_of(method).into_iter().enumerate() {
-                let path = sweep.model_path.as_str();
-                let stored = CompressedTokens::new(method, models, (lift, count), coding, (clip, path))?;
+                let stored = compressed(coding, sweep.model_path.as_str())?;
                 let kept_views = if i == 0 { kept_views } else { &[] };
                 let whole =
                     EvalKey { method, num_storage_tokens: count, num_render_tokens: count, tokens: Some(coding) };
@@ -103,6 +105,11 @@ fn add_jobs<'a>(
                     let some = EvalKey { num_render_tokens, ..whole };
                     let some = RenderJob::new(some, &stored, Some(selected), kept_views);
                     renderer.add_job(some, &stored, jobs, metrics)?;
+                }
+                if method == Method::Clift && models.codec.is_some() {
+                    // Without the path of the model: equal runs have equal results in any folder.
+                    let coded = compressed(TokenCoding::Coded(CodedLoss::default()), "")?;
+                    metrics.add_coded_bytes(whole, coded.file_bytes.unwrap_or_default());
                 }
             }
         }
@@ -185,7 +192,7 @@ impl TargetRenderer<'_> {
     }
 
     /// Adds a job and the size of its scene file, and renders one untimed view of a key that has no cost yet: one-time work of
-    /// the device.
+    /// the device, and the peak memory.
     fn add_job<'a>(
         &self,
         job: RenderJob<'a>,
@@ -194,12 +201,16 @@ impl TargetRenderer<'_> {
         metrics: &mut EvalResults,
     ) -> Result<(), EvalError> {
         if let Entry::Vacant(cost) = metrics.costs.entry(job.key) {
+            // Queued work must not count as rendering.
+            job.tokens.values.device().sync().map_err(ModelError::device)?;
+            let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
             self.render_view(&job, 0)?;
+            let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
             let target = &self.clip.target;
             let macs = job.model.config.render_macs(target.height, target.width, job.key.num_render_tokens)?;
             let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
             let scene_values = Some((job.key.num_storage_tokens * job.model.config.dim) as u64);
-            cost.insert(Cost { gflops, scene_values, scene_bytes: None });
+            cost.insert(Cost { gflops, scene_values, peak_bytes, ..Cost::default() });
         }
         if let Some(bytes) = stored.file_bytes {
             metrics.add_scene_bytes(job.key, bytes);

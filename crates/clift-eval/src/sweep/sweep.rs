@@ -19,6 +19,8 @@ pub struct Sweep {
     pub model: ModelConfig,
     /// LPIPS; `None` without its weights.
     pub lpips: Option<Lpips>,
+    /// Whether the device is a CPU, where the peak memory of the process includes the tensors.
+    pub is_cpu: bool,
     /// Whether the context views are rendered too, to find those that come out as fog.
     pub checks_contexts: bool,
     /// Seed of K-means and of random tokens. Every scene derives a seed of its own from this seed and its key.

@@ -92,13 +92,14 @@ impl Config {
 
     /// Returns the settings of an evaluation, without LPIPS.
     pub(crate) fn sweep(&self) -> Sweep {
-        let Self { seed, clusters, model, eval, .. } = self;
+        let Self { seed, clusters, model, device, eval, .. } = self;
         Sweep {
             eval: eval.clone(),
             model_path: self.run_dir.display().to_string(),
             kmeans: clusters.kmeans.clone(),
             model: model.clone(),
             lpips: None,
+            is_cpu: device.is_cpu(),
             checks_contexts: false,
             seed: derive_seed(*seed, "eval"),
         }
