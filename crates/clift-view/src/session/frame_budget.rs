@@ -70,4 +70,17 @@ mod tests {
         budget.record(0.1, 0.03, wanted);
         assert_eq!(budget.reduce(wanted).tokens, 144, "two steps");
     }
+
+    #[test]
+    fn only_fast_frames_in_a_row_restore() {
+        let wanted = FrameSettings { tokens: 256, size: 2 };
+        let mut budget = FrameBudget::default();
+        budget.record(0.04, 0.03, wanted);
+        let reduced = budget.reduce(wanted);
+        for _ in 0..4 {
+            (1..PATIENCE).for_each(|_| budget.record(0.01, 0.03, wanted));
+            budget.record(0.025, 0.03, wanted);
+        }
+        assert_eq!(budget.reduce(wanted), reduced);
+    }
 }

@@ -72,4 +72,16 @@ mod tests {
         assert_eq!(centroids([2.000_02, 3.0, 1.999_98, 1.000_01, 1.0]), [0, 3]);
         assert_eq!(centroids([2.01, 3.0, 1.99, 1.0, 0.99]), [2, 4], "differences above rounding decide");
     }
+
+    #[test]
+    fn empty_clusters_take_the_farthest_tokens_of_larger_clusters() {
+        let reseeded = |assignment: [u32; 5], num_clusters| {
+            let mut labels = Labels { assignment: assignment.to_vec(), distance: vec![1.0, 3.0, 9.0, 3.0, 0.5] };
+            labels.reseed_empty(num_clusters);
+            (labels.assignment, labels.distance)
+        };
+        assert_eq!(reseeded([0, 0, 2, 0, 2], 5), (vec![0, 3, 1, 4, 2], vec![1.0, 0.0, 0.0, 0.0, 0.5]));
+        // The farthest token is alone in its cluster.
+        assert_eq!(reseeded([0, 0, 2, 0, 0], 4), (vec![0, 1, 2, 3, 0], vec![1.0, 0.0, 9.0, 0.0, 0.5]));
+    }
 }
