@@ -7,15 +7,15 @@ use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::packing::{lanes_of, pack_across, pack_rows, pack_transposed};
 use crate::primitives::scratch::Scratch;
 use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
-use crate::simd::vector::{Operands, Simd};
+use crate::simd::vector::{MATRIX_ROWS, Operands, Simd};
 
 /// Values along the inner dimension that are multiplied before the next ones. A panel of B takes 48 KB of the L2 cache, which
 /// reads it in less time than the tile multiplies; larger blocks read and write the sums less often.
 const INNER_BLOCK: usize = 768;
 /// Most rows of a task: its part of A stays in the L2 cache.
 const ROW_BLOCK: usize = 96;
-/// Fewest rows of a task: every task reads the whole of B.
-const FEWEST_ROWS: usize = 24;
+/// Fewest rows of a task, those of a matrix tile: every task reads the whole of B.
+const FEWEST_ROWS: usize = MATRIX_ROWS;
 
 /// A matrix in a slice. Its rows are contiguous, or its columns if it is `transposed`.
 #[derive(Clone, Copy, Debug)]
