@@ -1,7 +1,5 @@
 //! The kernels that a computation launches on a GPU.
 
-use std::collections::BTreeMap;
-
 use burn::tensor::Device;
 use serde::Serialize;
 
@@ -22,6 +20,8 @@ pub struct KernelLaunches {
 /// timed; otherwise the kernels are compiled and not run, and all results are undefined.
 #[cfg(feature = "wgpu")]
 pub fn observe_kernels<T>(is_timed: bool, run: impl FnOnce() -> T) -> (T, Vec<KernelLaunches>) {
+    use std::collections::BTreeMap;
+
     use clift_cube::Observation;
     let (result, launches) = clift_cube::observe(if is_timed { Observation::Timed } else { Observation::DryRun }, run);
     let mut kernels: BTreeMap<String, KernelLaunches> = BTreeMap::new();
