@@ -19,7 +19,7 @@ pub(crate) struct ByteSpan {
     header_start: u64,
     start: u32,
     length: u32,
-    /// Checksum of the whole member; 0 for a part, and for files that `torch.save` wrote without checksums.
+    /// Checksum of the whole member; 0 for a part, and where checksums are switched off.
     crc32: u32,
 }
 
@@ -113,6 +113,11 @@ impl Archive {
             return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
         }
         member.read(path)
+    }
+
+    /// Returns whether the file was written without checksums, as after `torch.serialization.set_crc32_options(False)`.
+    pub fn lacks_checksums(&self) -> bool {
+        self.members.values().all(|member| member.crc32 == 0)
     }
 
     pub fn member(&self, name: &str) -> Option<ByteSpan> {

@@ -13,7 +13,7 @@ use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::index_cache::{CachedChunk, CachedScene, ChunkIndexCache};
-use crate::sources::chunks::table::{CHUNKS_PER_CALL, ChunkTable, ScanProgress, SceneTable};
+use crate::sources::chunks::table::{CHUNKS_PER_CALL, ChunkTable, ODDITIES, ScanProgress, SceneTable};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::{DL3DV_PREFIX, find_by_name};
 
@@ -184,8 +184,8 @@ impl ChunkSource {
             failure.or_else(|| filter(scene).unwrap_or_else(|error| Some(error.to_string())))
         };
         let reasons: Vec<Option<String>> = (0..self.scenes.len()).into_par_iter().map(reason).collect();
-        let mut with_far_cameras = Vec::new();
-        for (entry, reason) in std::mem::take(&mut self.scenes).into_iter().zip(reasons) {
+        let (scenes, mut odd) = (std::mem::take(&mut self.scenes), ODDITIES.map(|what| (what, Vec::new())));
+        for (entry, reason) in scenes.into_iter().zip(reasons) {
             if let Some(reason) = reason {
                 self.report.skip(entry.key, reason);
                 continue;
@@ -196,15 +196,19 @@ impl ChunkSource {
             for (frame, reason) in table.map(|table| &table.unusable).or_else(cached).into_iter().flatten() {
                 self.report.skip_frame(&entry.key, frame.to_string(), reason);
             }
-            with_far_cameras.extend(table.filter(|table| table.has_far_cameras).map(|_| entry.key.clone()));
+            for ((_, keys), is_odd) in odd.iter_mut().zip(table.into_iter().flat_map(|table| table.oddities)) {
+                keys.extend(is_odd.then(|| entry.key.clone()));
+            }
             self.scenes.push(entry);
         }
-        if !with_far_cameras.is_empty() {
-            self.report.notes.push(format!(
-                "{} with cameras far from the others, which set the scale if they are contexts ({})",
-                plural(with_far_cameras.len(), "scene"),
-                first_few(&with_far_cameras)
-            ));
+        for (what, keys) in odd.iter().filter(|(_, keys)| !keys.is_empty()) {
+            self.report.notes.push(format!("{} {what} ({})", plural(keys.len(), "scene"), first_few(keys)));
+        }
+        let tables = self.chunks.iter().filter_map(|chunk| chunk.table.get());
+        let num_unchecked = tables.filter(|table| table.lacks_checksums).count();
+        if num_unchecked > 0 {
+            let files = plural(num_unchecked, "file");
+            self.report.notes.push(format!("{files} without checksums: damage would not be noticed"));
         }
         Ok(())
     }

@@ -25,6 +25,13 @@ pub(crate) const CHUNKS_PER_CALL: usize = 64;
 /// Progress callback of a scan: numbers of examined chunks, and of all.
 pub type ScanProgress<'a> = &'a mut dyn FnMut(usize, usize);
 
+/// What is odd in a scene, for the notes of a report.
+pub(crate) const ODDITIES: [&str; 3] = [
+    "without time stamps as int64: frames count 0, 1, ..",
+    "with scaled rotations, whose scale was divided out",
+    "with cameras far from the others, which set the scale if they are contexts",
+];
+
 pub(crate) struct SceneTable {
     pub key: String,
     cameras: ByteSpan,
@@ -33,14 +40,16 @@ pub(crate) struct SceneTable {
     pub images: Vec<ByteSpan>,
     /// Frames of the file whose cameras cannot be used, in order, with the reasons.
     pub unusable: Vec<(usize, String)>,
-    /// Whether cameras are far from the others.
-    pub has_far_cameras: bool,
+    /// Which of [`ODDITIES`] the scene has.
+    pub oddities: [bool; ODDITIES.len()],
     /// Largest field of view of the usable frames, in degrees; `None` for unreadable cameras.
     pub fov_deg: Option<f64>,
 }
 
 pub(crate) struct ChunkTable {
     pub scenes: HashMap<String, SceneTable>,
+    /// Whether the file was written without checksums.
+    pub lacks_checksums: bool,
 }
 
 impl ChunkTable {
@@ -64,7 +73,7 @@ impl ChunkTable {
         for scene in scenes.values_mut() {
             scene.leave_out_unusable(path);
         }
-        Ok(Self { scenes })
+        Ok(Self { scenes, lacks_checksums: archive.lacks_checksums() })
     }
 }
 
@@ -98,12 +107,15 @@ impl Builder<'_> {
                 .map_err(|what| in_scene(format!("`images[{frame}]`: {what}")))?;
             images.push(span);
         }
-        let (shape, types) = ([Some(num_frames), Some(18)], [ElementType::F32, ElementType::F64]);
-        let (cameras, camera_type) = tensor_span(item("cameras")?, &shape, &types, archive)
-            .map_err(|what| in_scene(format!("`cameras`: {what}")))?;
-        let (unusable, has_far_cameras, fov_deg) = (Vec::new(), false, None);
-        let table = SceneTable { key: key.clone(), cameras, camera_type, images, unusable, has_far_cameras, fov_deg };
-        self.scenes.insert(key.clone(), table);
+        let tensor = |name: &str, shape: &[Option<u64>], types: &[ElementType]| {
+            tensor_span(item(name)?, shape, types, archive).map_err(|what| in_scene(format!("`{name}`: {what}")))
+        };
+        let (cameras, camera_type) =
+            tensor("cameras", &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64])?;
+        let oddities = [tensor("timestamps", &[Some(num_frames)], &[ElementType::I64]).is_err(), false, false];
+        let (key, unusable, fov_deg) = (key.clone(), Vec::new(), None);
+        let table = SceneTable { key, cameras, camera_type, images, unusable, oddities, fov_deg };
+        self.scenes.insert(table.key.clone(), table);
         Ok(())
     }
 }
@@ -115,7 +127,10 @@ impl SceneTable {
         let mut cameras = Vec::with_capacity(rows.len());
         for (frame, row) in rows.into_iter().enumerate() {
             match camera_of_row(row) {
-                Ok((camera, _)) => cameras.push(camera),
+                Ok((camera, scale)) => {
+                    self.oddities[1] |= scale.is_some();
+                    cameras.push(camera);
+                }
                 Err(error) => self.unusable.push((frame, format!("whose camera cannot be used: {error}"))),
             }
             if self.unusable.len() > MAX_UNUSABLE {
@@ -125,7 +140,7 @@ impl SceneTable {
             }
         }
         let centres: Vec<_> = cameras.iter().map(|camera| camera.c2w.translation).collect();
-        self.has_far_cameras = !far_cameras(&centres).is_empty();
+        self.oddities[2] = !far_cameras(&centres).is_empty();
         self.fov_deg = Some(widest_fov_deg(&cameras));
         let images = std::mem::take(&mut self.images);
         self.images = self.usable(images);

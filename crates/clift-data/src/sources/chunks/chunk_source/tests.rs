@@ -118,7 +118,7 @@ fn scenes_of_failing_chunks_are_skipped_with_the_error() {
 }
 
 #[test]
-fn frames_whose_cameras_cannot_be_used_are_skipped_and_far_cameras_noted() {
+fn frames_whose_cameras_cannot_be_used_are_skipped_and_odd_cameras_noted() {
     let folder = tempfile::tempdir().unwrap();
     let source = re10k_mini(Split::Train);
     let records = (0..2).map(|scene| {
@@ -126,6 +126,9 @@ fn frames_whose_cameras_cannot_be_used_are_skipped_and_far_cameras_noted() {
         if scene == 0 {
             cameras[3].c2w.translation[1] = f64::NAN;
         } else {
+            for camera in &mut cameras {
+                camera.c2w.rotation *= 4.0;
+            }
             cameras[5].c2w.translation[1] = 1e5;
         }
         let images = (0..8).map(|frame| source.encoded_frame(scene, frame).unwrap().unwrap()).collect();
@@ -138,7 +141,8 @@ fn frames_whose_cameras_cannot_be_used_are_skipped_and_far_cameras_noted() {
     assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 7));
     let [skip] = &source.report.frames[..] else { panic!("{}", source.report) };
     assert!(skip.frame == "3" && skip.reason.starts_with("whose camera cannot be used: bad camera: "), "{skip:?}");
-    let [far] = &source.report.notes[..] else { panic!("{}", source.report) };
+    let [scaled, far] = &source.report.notes[..] else { panic!("{}", source.report) };
+    assert!(scaled.starts_with("1 scene with scaled rotations") && scaled.contains("a2)"), "{scaled}");
     assert!(far.starts_with("1 scene with cameras far from the others") && far.contains("a2)"), "{far}");
     assert_eq!(source.cameras(scene).unwrap()[3], whole.cameras(0).unwrap()[4]);
     assert_eq!(source.frame(scene, 3).unwrap(), whole.frame(0, 4).unwrap());
@@ -171,7 +175,7 @@ fn odd_chunk(extra: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn unused_entries_of_any_kind_are_skipped() {
+fn unused_entries_of_any_kind_are_skipped_and_time_stamps_may_be_missing() {
     let tensor = |storage_type: &str, bytes: usize| {
         let mut writer = PickleWriter::new();
         writer.tensor(storage_type, vec![0; bytes], &[2]);
@@ -182,6 +186,7 @@ fn unused_entries_of_any_kind_are_skipped() {
     let numpy = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85c_codecs\nencode\nX\x01\0\0\0bX\x06\0\0\0latin1\x86R\x87R\
         (K\x01K\x02\x85cnumpy\ndtype\nX\x02\0\0\0f4\x89\x88\x87R(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89C\x02xytb";
     for (what, extra) in [
+        ("int64 tensor", entry("timestamps", &tensor("LongStorage", 16))),
         ("int32 tensor", entry("timestamps", &tensor("IntStorage", 8))),
         ("list", entry("timestamps", b"](K\x01K\x02e")),
         ("numpy array", entry("depth", numpy)),
@@ -194,6 +199,8 @@ fn unused_entries_of_any_kind_are_skipped() {
     ] {
         let (_folder, source) = open_chunk(&odd_chunk(&extra), &["a"]);
         assert!(source.frame(0, 1).is_ok() && source.cameras(0).is_ok(), "{what}");
+        let note = "1 scene without time stamps as int64: frames count 0, 1, .. (a)";
+        assert_eq!(source.report.notes == [note], what != "int64 tensor", "{what}: {}", source.report);
     }
     let call = entry("x", b"cbuiltins\neval\nX\x02\0\0\0ls\x85R");
     let message = num_frames(&odd_chunk(&call), "a").unwrap_err();
@@ -212,6 +219,7 @@ fn chunks_without_checksums_are_read() {
     }
     let (_folder, source) = open_chunk(&bytes, &["00000000000000a1", "00000000000000a2"]);
     assert_eq!(source.frame(0, 3).unwrap(), re10k_mini(Split::Train).frame(0, 3).unwrap());
+    assert_eq!(source.report.notes, ["1 file without checksums: damage would not be noticed"]);
 }
 
 #[test]
