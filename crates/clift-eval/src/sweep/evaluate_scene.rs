@@ -201,8 +201,6 @@ impl TargetRenderer<'_> {
         metrics: &mut EvalResults,
     ) -> Result<(), EvalError> {
         if let Entry::Vacant(cost) = metrics.costs.entry(job.key) {
-            // Queued work must not count as rendering.
-            job.tokens.values.device().sync().map_err(ModelError::device)?;
             let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
             self.render_view(&job, 0)?;
             let peak_bytes = if has_peak { memory::peak_bytes() } else { None };

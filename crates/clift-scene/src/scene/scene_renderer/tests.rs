@@ -114,28 +114,91 @@ fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
     }
 }
 
-// The tests of `frame_size` compare every pixel of frames of other sizes with the directions of its cameras.
+/// Returns the middle of a frame by bicubic convolution of an image, `scale` pixels of the image per pixel: an independent
+/// reference in f64, with the filter of Pillow's BICUBIC.
+fn resampled(image: &[f32], [rows, columns]: [usize; 2], scale: f64, [height, width]: [usize; 2]) -> Vec<f32> {
+    let cubic = |x: f64| match x.abs() {
+        x if x < 1.0 => (1.5 * x - 2.5) * x * x + 1.0,
+        x if x < 2.0 => ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0,
+        _ => 0.0,
+    };
+    let taps = |from: usize, to: usize, pixel: usize| {
+        let centre = (pixel as f64 + 0.5 - to as f64 / 2.0) * scale + from as f64 / 2.0 - 0.5;
+        let weights: Vec<f64> = (0..from).map(|i| cubic((i as f64 - centre) / scale.max(1.0))).collect();
+        let sum: f64 = weights.iter().sum();
+        weights.into_iter().map(|weight| weight / sum).collect::<Vec<f64>>()
+    };
+    let across: Vec<Vec<f64>> = (0..width).map(|pixel| taps(columns, width, pixel)).collect();
+    let down: Vec<Vec<f64>> = (0..height).map(|pixel| taps(rows, height, pixel)).collect();
+    let pixel = |row: usize, column: usize, channel: usize| {
+        let value = |y: usize, x: usize| f64::from(image[(y * columns + x) * 3 + channel]);
+        let line = |y: usize| across[column].iter().enumerate().map(|(x, weight)| weight * value(y, x)).sum::<f64>();
+        down[row].iter().enumerate().map(|(y, weight)| weight * line(y)).sum::<f64>() as f32
+    };
+    (0..height * width * 3).map(|i| pixel(i / 3 / width, i / 3 % width, i % 3)).collect()
+}
+
+fn middle(frame: &[f32], width: usize, columns: usize) -> Vec<f32> {
+    let left = (width - columns) / 2;
+    frame.chunks(width * 3).flat_map(|row| &row[left * 3..][..columns * 3]).copied().collect()
+}
+
 #[test]
-fn the_middle_of_wide_frames_is_the_rendering_of_the_trained_size() {
+fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
     let device = Device::flex();
-    for (encoding, patch_grids) in [
+    // The trained image has 24 x 16 pixels; sizes are height and width.
+    let sizes: [[usize; 2]; 20] = [
+        [8, 12],
+        [12, 18],
+        [14, 21],
+        [16, 24],
+        [17, 25],
+        [20, 30],
+        [24, 36],
+        [31, 47],
+        [32, 48],
+        [40, 60],
+        [48, 72],
+        [64, 96],
+        [128, 192],
+        [16, 12],
+        [40, 40],
+        [64, 24],
+        [16, 36],
+        [24, 60],
+        [32, 128],
+        [48, 192],
+    ];
+    for (encoding, grids) in [
         (CameraEncoding::Plucker, PatchGrids::One),
         (CameraEncoding::Gta, PatchGrids::Two),
         (CameraEncoding::Gta, PatchGrids::Four),
     ] {
-        let config = ModelConfig { patch_grids, ..encoded(encoding) };
+        let config = ModelConfig { patch_grids: grids, ..encoded(encoding) };
         let renderer = Network::new(&config, 3, &device).renderer;
         let scene = whole_scene(&renderer, &config);
         let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
-        let mut frames = |size: [usize; 2]| {
-            let views = [camera(0.1, 0.2), camera(-0.2, -0.1)].map(|view| view.resized([16, 24], size));
-            renderer.render(&views, size[0], size[1], 12).unwrap()
+        let mut frame = |size: [usize; 2], count| {
+            renderer.reset();
+            let view = camera(0.1, 0.2).resized([16, 24], size);
+            renderer.render(&[view], size[0], size[1], count).unwrap().remove(0).pixels
         };
-        // Eight pixels, a window, on either side.
-        for (wide, trained) in frames([16, 40]).iter().zip(frames([16, 24])) {
-            let middle: Vec<f32> = wide.pixels.chunks(40 * 3).flat_map(|row| &row[8 * 3..32 * 3]).copied().collect();
-            let db = psnr(&middle, &trained.pixels).unwrap();
-            assert!(db > 80.0, "{encoding:?}, {patch_grids:?}: {db} dB");
+        for (size, count) in sizes.into_iter().flat_map(|size| [(size, 12), (size, 5)]) {
+            let [height, width] = size;
+            let trained = frame([16, 24], count);
+            // The columns of the frame inside of the trained field of view, in the middle. Those of a wide frame mix with
+            // others within the reach of the filter, two pixels.
+            let inside = height * 3 / 2;
+            let reach = 2 * height.div_ceil(8);
+            let columns = if width > inside { inside - (width - inside) % 2 - reach } else { width };
+            // Of a wide frame other tokens may be selected.
+            if width > inside + 1 && count < 12 {
+                continue;
+            }
+            let expected = resampled(&trained, [16, 24], 16.0 / height as f64, [height, columns]);
+            let got = middle(&frame(size, count), width, columns);
+            let db = psnr(&got, &expected).unwrap();
+            assert!(db >= 45.0, "{encoding:?}, {size:?}, {count} tokens: {db} dB");
         }
     }
 }
