@@ -19,15 +19,6 @@ pub(crate) fn count_argument(bytes: usize) {
     ARGUMENTS.set(ARGUMENTS.get() + bytes as u64);
 }
 
-/// How the launches of a computation are observed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Observation {
-    /// Each is timed on the device.
-    Timed,
-    /// Kernels are compiled and not run: all results are undefined.
-    DryRun,
-}
-
 /// A launch of a kernel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Launch {
@@ -69,10 +60,9 @@ impl LaunchObserver for Observer {
     }
 }
 
-/// Runs a computation and returns its result and the kernels that it launches, in order. Launches of other threads are counted
-/// too.
-pub fn observe<T>(observation: Observation, run: impl FnOnce() -> T) -> (T, Vec<Launch>) {
-    let is_timed = observation == Observation::Timed;
+/// Runs a computation and returns its result and the kernels that it launches, in order; the whole process is observed. Every
+/// launch is timed on the device if `is_timed`. Otherwise the kernels are compiled and not run, and all results are undefined.
+pub fn observe<T>(is_timed: bool, run: impl FnOnce() -> T) -> (T, Vec<Launch>) {
     let timing = if is_timed { TimingRequest::Deferred } else { TimingRequest::None };
     let observer = Arc::new(Observer { launches: Mutex::default(), timing });
     let dry_run = (!is_timed).then(DryRun::new);

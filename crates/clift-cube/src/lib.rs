@@ -41,7 +41,7 @@ pub use buffers::adamw::{AdamW, adamw, gradient_norm};
 pub use buffers::buffer::{Buffer, Matrices, Values};
 pub use buffers::elementwise::cast;
 pub use buffers::reduce::sum_rows;
-pub use ledger::{Launch, Observation, observe, reserved_bytes};
+pub use ledger::{Launch, observe, reserved_bytes};
 pub use products::convolution::{KERNEL_LEN, convolve};
 pub use products::matrix_product::MatrixTile;
 pub use products::product::Product;

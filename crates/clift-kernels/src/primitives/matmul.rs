@@ -86,7 +86,7 @@ pub(crate) fn multiply<S: Simd, O: Operands>(
     }
 }
 
-/// Computes [`multiply`] by matrix tiles, of which the rows and columns are multiples. A transposed A is copied in blocks.
+/// Computes [`multiply`] by matrix tiles, for multiples of [`MATRIX_ROWS`] rows and columns. A transposed A is copied in blocks.
 ///
 /// # Safety
 /// A has `rows` rows of `inner` lanes, B all panels of `columns` columns, and C `rows` rows of `columns` columns.

@@ -4,7 +4,7 @@ use burn::tensor::Device;
 use serde::Serialize;
 
 /// All launches of one kernel.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KernelLaunches {
     /// Path of the kernel, without the crate; `burn: ..` for kernels of Burn.
     pub kernel: String,
@@ -22,14 +22,15 @@ pub struct KernelLaunches {
 pub fn observe_kernels<T>(is_timed: bool, run: impl FnOnce() -> T) -> (T, Vec<KernelLaunches>) {
     use std::collections::BTreeMap;
 
-    use clift_cube::Observation;
-    let (result, launches) = clift_cube::observe(if is_timed { Observation::Timed } else { Observation::DryRun }, run);
+    let (result, launches) = clift_cube::observe(is_timed, run);
     let mut kernels: BTreeMap<String, KernelLaunches> = BTreeMap::new();
     for launch in launches {
-        let name = short_name(launch.kernel);
-        let bytes = (!name.starts_with("burn")).then_some(0);
-        let first = || KernelLaunches { kernel: name.clone(), count: 0, bytes, seconds: Some(0.0) };
-        let entry = kernels.entry(name.clone()).or_insert_with(first);
+        let entry = kernels.entry(short_name(launch.kernel)).or_insert_with_key(|name| KernelLaunches {
+            kernel: name.clone(),
+            count: 0,
+            bytes: (!name.starts_with("burn")).then_some(0),
+            seconds: Some(0.0),
+        });
         entry.count += 1;
         entry.bytes = entry.bytes.map(|sum| sum + launch.bytes);
         entry.seconds = entry.seconds.zip(launch.seconds).map(|(sum, seconds)| sum + seconds);

@@ -67,7 +67,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         trained: stage.trained(),
         num_scenes,
         is_accumulated: num_scenes < settings.batch_size,
-        // A GPU without matrix instructions computes f16 in f32.
+        // Of GPUs with matrix instructions: without them f16 is computed, and saved, in f32.
         saves_half: match config.precision {
             Precision::F32 => false,
             Precision::Bf16 => true,

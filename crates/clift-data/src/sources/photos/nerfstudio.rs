@@ -182,11 +182,12 @@ impl<'a> Frame<'a> {
         Ok(Some([width, height]))
     }
 
-    /// Returns the size of the images to which the intrinsics apply, where it is not given, as far as the principal point tells
-    /// it, and whether the image is smaller. `stored` is the size of the image, `assumed` that of the pixels of the poses.
+    /// Guesses the size of the calibrated images from the principal point, which is near their centre; `None` if it does not
+    /// decide. Also returns whether the stored image is smaller.
     ///
-    /// Poses of an image with an EXIF orientation that exchanges its sides may be those of the turned one, whose centre is then
-    /// nearer. Images that are much smaller than the calibration have the nearest multiple of their size.
+    /// `[width, height]` is the size of the stored image, `assumed` that of the pixels in which the poses were computed. If the
+    /// EXIF orientation `exchanges` the sides, the size may be that of the turned image. A calibration of much larger images is
+    /// taken to have the nearest multiple of the size.
     fn guessed_size(
         &self,
         [width, height]: [f64; 2],

@@ -78,8 +78,8 @@ pub(crate) struct Photo {
     pub poses_from: PosesFrom,
 }
 
-/// How the EXIF orientation of a photo is used. Some tools turn photos before they compute cameras; others, such as COLMAP,
-/// take the stored pixels.
+/// How a photo is turned by its EXIF orientation. Some tools turn photos before they compute cameras; others, such as COLMAP,
+/// compute them from the stored pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Turn {
     /// Turns the pixels alone, to those of the camera.

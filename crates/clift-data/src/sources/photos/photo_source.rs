@@ -38,7 +38,8 @@ const COUNTED: [&str; 6] = [
 
 /// Largest size of the decoded photos in memory, in bytes.
 const MAX_DECODED_BYTES: usize = 1 << 30;
-/// Smallest size of such a photo in pixels, and over those of the scaled image: others are decoded in a few milliseconds.
+/// Photos are kept in memory from this number of pixels on, if they have [`MIN_DECODED_RATIO`] times as many as the scaled image:
+/// smaller ones are decoded in a few milliseconds.
 const MIN_DECODED_PIXELS: usize = 640 * 480;
 const MIN_DECODED_RATIO: usize = 4;
 

@@ -247,7 +247,7 @@ fn unchanged_chunks_are_not_read_again() {
     assert_eq!([(); 2].map(|()| opened(wide.clone())), [3, 0].map(|tables| (tables, 24, all.clone())));
     let narrow = opened(SceneFilters { max_fov_deg: Some(50.0), ..wide });
     assert_eq!(narrow, (0, 0, "0 of 3 scenes used; 3 with a field of view above 50 degrees".into()));
-    // Another chunk takes the place of one: its scene is not that of the index. Unreadable ones are read at every opening.
+    // A chunk is replaced by a copy of another, which lacks the scene of the index. Unreadable chunks are read at every opening.
     std::fs::copy(folder.path().join("000001.torch"), folder.path().join("000002.torch")).unwrap();
     let (_, num_frames, report) = opened(frames.clone());
     assert!(num_frames == 16 && report.contains("expected scene scene-2, found 1 other scene"), "{report}");
