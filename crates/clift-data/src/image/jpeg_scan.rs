@@ -157,7 +157,7 @@ impl Frame {
             return Err(if parts.len() * interval < num_units { ENDS_EARLY } else { LEFT_OVER });
         }
         for (part, bytes) in parts.into_iter().enumerate() {
-            let mut bits = Bits { bytes, at: 0 };
+            let mut bits = Bits::new(bytes);
             for _ in 0..interval.min(num_units - part * interval) {
                 for (component, tables) in &scanned {
                     for _ in 0..if scanned.len() > 1 { component.blocks } else { 1 } {
@@ -165,7 +165,7 @@ impl Frame {
                     }
                 }
             }
-            if bits.bytes.len() - bits.at.div_ceil(8) > MAX_LEFT_OVER {
+            if (bits.end - bits.at) / 8 > MAX_LEFT_OVER {
                 return Err(LEFT_OVER);
             }
         }
@@ -178,19 +178,21 @@ impl Frame {
 fn split_scan(data: &[u8]) -> Option<(Vec<Vec<u8>>, usize)> {
     let (mut parts, mut part, mut at) = (Vec::new(), Vec::new(), 0);
     loop {
-        let (value, length) = match data.get(at..)? {
-            [0xff, 0xff, ..] => (None, 1),
-            [0xff, 0, ..] => (Some(0xff), 2),
-            [0xff, 0xd0..=0xd7, ..] => {
-                parts.push(std::mem::take(&mut part));
-                (None, 2)
+        let run = data[at..].iter().position(|byte| *byte == 0xff)?;
+        part.extend(&data[at..at + run]);
+        at += run;
+        match data.get(at + 1)? {
+            0xff => at += 1,
+            0 => {
+                part.push(0xff);
+                at += 2;
             }
-            [0xff, _, ..] => break,
-            [byte, ..] => (Some(*byte), 1),
-            [] => return None,
-        };
-        part.extend(value);
-        at += length;
+            0xd0..=0xd7 => {
+                parts.push(std::mem::take(&mut part));
+                at += 2;
+            }
+            _ => break,
+        }
     }
     if parts.is_empty() || !part.is_empty() {
         parts.push(part);
@@ -198,22 +200,30 @@ fn split_scan(data: &[u8]) -> Option<(Vec<Vec<u8>>, usize)> {
     Some((parts, at))
 }
 
+/// A position in bits.
 struct Bits {
+    /// The data, and zeros for the code at its end.
     bytes: Vec<u8>,
     at: usize,
+    end: usize,
 }
 
 impl Bits {
+    fn new(mut bytes: Vec<u8>) -> Self {
+        let end = 8 * bytes.len();
+        bytes.extend([0; 4]);
+        Self { bytes, at: 0, end }
+    }
+
     fn skip(&mut self, count: u8) -> Result<(), &'static str> {
         self.at += usize::from(count);
-        if self.at > 8 * self.bytes.len() { Err(ENDS_EARLY) } else { Ok(()) }
+        if self.at > self.end { Err(ENDS_EARLY) } else { Ok(()) }
     }
 
     /// Reads a symbol; returns its high and low half.
     fn symbol(&mut self, table: Option<&Table>) -> Result<(u8, u8), &'static str> {
-        let byte = |index: usize| self.bytes.get(self.at / 8 + index).map_or(0, |byte| usize::from(*byte));
-        let next = (byte(0) << 16 | byte(1) << 8 | byte(2)) >> (8 - self.at % 8);
-        let (length, symbol) = table.ok_or(BAD_CODE)?[next & 0xffff];
+        let next = self.bytes[self.at / 8..].first_chunk().map_or(0, |four| u32::from_be_bytes(*four));
+        let (length, symbol) = table.ok_or(BAD_CODE)?[(next << (self.at % 8) >> 16) as usize];
         self.skip(length)?;
         if length == 0 { Err(BAD_CODE) } else { Ok((symbol >> 4, symbol & 15)) }
     }
