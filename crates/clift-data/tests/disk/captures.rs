@@ -424,6 +424,30 @@ fn large_photos_are_decoded_once_and_fit_to_the_same_pixels() {
 }
 
 #[test]
+fn distortion_of_large_photos_is_removed_at_four_times_the_size() {
+    let root = tempfile::tempdir().unwrap();
+    let (width, height) = (900, 600);
+    let wave = |x: usize, y: usize| (128.0 + 90.0 * (x as f64 / 60.0).sin() * (y as f64 / 50.0).cos()) as u8;
+    let rgb = (0..width * height).flat_map(|i| [wave(i % width, i / width); 3]).collect();
+    let images = [("0.png", encode_png(&RgbImage { width, height, rgb }).unwrap()), ("1.png", gray(60, 9))];
+    let frames = [frame_at(0.0, "0.png"), frame_at(1.0, "1.png")];
+    write_capture(root.path(), &images, &json!({"fl_x": 800, "k1": -0.2, "frames": frames}));
+    let fitted = |min_size, undistort| {
+        let files = FileOptions { undistort: Some(undistort), ..FileOptions::default() };
+        let options = SourceOptions { min_size, files, ..SourceOptions::default() };
+        let source = crate::open(root.path(), Split::Test, &options).unwrap().source;
+        let frame = source.frame(0, 0).unwrap();
+        let (fitted, camera) = fit_image(&frame, source.cameras(0).unwrap()[0].intrinsics, 32, 32).unwrap();
+        (frame.width, fitted.rgb, camera)
+    };
+    let most = |a: &[u8], b: &[u8]| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+    let ((full, expected, camera), (reduced, got, same)) = (fitted([0; 2], true), fitted([32; 2], true));
+    assert_eq!((full, reduced, camera), (900, 192, same));
+    assert!(most(&got, &expected) <= 2, "{}", most(&got, &expected));
+    assert!(most(&fitted([32; 2], false).1, &expected) > 20, "the distorted image would pass");
+}
+
+#[test]
 fn hidden_files_are_ignored() {
     // A file that macOS writes beside a copied one.
     for (layout, hidden) in

@@ -15,6 +15,7 @@ use crate::geometry::lens::Lens;
 use crate::image::codec::{
     apply_orientation, check_end, decode_image, decode_with_alpha, exif_orientation, has_alpha, read_header,
 };
+use crate::image::fit::covering_size;
 use crate::image::jpeg_scan::check_image;
 use crate::image::lanczos::resize_lanczos;
 use crate::image::undistort::Undistortion;
@@ -23,6 +24,8 @@ use crate::sources::filters::SceneFilters;
 pub(crate) const MAX_FRAMES: usize = 100_000;
 /// Largest size of an image file, in bytes.
 const MAX_IMAGE_BYTES: u64 = 256 << 20;
+/// Photos are reduced to this multiple of the size that they must cover before their lens distortion is removed.
+const UNDISTORTED_SCALE: usize = 4;
 /// Largest relative error of an image's aspect ratio against its camera's: rounding of images a few dozen pixels wide.
 const MAX_SHAPE_ERROR: f64 = 0.02;
 
@@ -189,10 +192,12 @@ impl Photo {
     }
 
     /// Decodes the image over a background, turns it to the orientation of its camera and undistorts it, and its coverage
-    /// likewise (see [`SceneSource::frame_with_coverage`](crate::SceneSource::frame_with_coverage)).
+    /// likewise (see [`SceneSource::frame_with_coverage`](crate::SceneSource::frame_with_coverage)). `least` are the columns and
+    /// rows that the result must cover: a much larger image with lens distortion is reduced.
     pub fn decode(
         &self,
         background: [u8; 3],
+        least: [usize; 2],
         key: &str,
         frame: usize,
     ) -> Result<(RgbImage, Option<RgbImage>), DataError> {
@@ -214,12 +219,22 @@ impl Photo {
         let prepare = |image: RgbImage| {
             let image = apply_orientation(image, pixels);
             let image = match &self.undistortion {
-                Some(undistortion) => undistortion.apply(&image),
+                Some(undistortion) => undistortion.apply(&self.reduced(image, least)),
                 None => image,
             };
             apply_orientation(image, self.view_turn)
         };
         Ok((prepare(image), coverage.map(prepare)))
+    }
+
+    /// Reduces an image whose sides are more than [`UNDISTORTED_SCALE`] times those that its undistorted view must have.
+    fn reduced(&self, image: RgbImage, [mut width, mut height]: [usize; 2]) -> RgbImage {
+        if exchanges(self.view_turn) {
+            (width, height) = (height, width);
+        }
+        let from = (image.width, image.height);
+        let (width, height) = covering_size(from, (UNDISTORTED_SCALE * width, UNDISTORTED_SCALE * height));
+        if width < from.0 && width * height > 0 { resize_lanczos(&image, width, height) } else { image }
     }
 
     /// Turns the camera, and on load the image, by an orientation that does not mirror.

@@ -38,9 +38,7 @@ const COUNTED: [&str; 6] = [
 
 /// Largest size of the decoded photos in memory, in bytes.
 const MAX_DECODED_BYTES: usize = 1 << 30;
-/// Photos are kept in memory from this number of pixels on, if they have [`MIN_DECODED_RATIO`] times as many as the scaled image:
-/// smaller ones are decoded in a few milliseconds.
-const MIN_DECODED_PIXELS: usize = 640 * 480;
+/// Photos are kept in memory if they have this many times the pixels of the scaled image.
 const MIN_DECODED_RATIO: usize = 4;
 
 /// Largest number of scenes, and of bytes of the images of a scene, whose JPEG files are read to find damage.
@@ -295,7 +293,8 @@ impl SceneSource for PhotoSource {
 
     fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
         let photo = self.photo(scene, frame)?;
-        let decode = || photo.decode(self.options.background, self.key(scene), frame);
+        let [width, height] = self.options.min_size;
+        let decode = || photo.decode(self.options.background, [width, height], self.key(scene), frame);
         let lock = || self.decoded.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(image) = lock().get(&(scene, frame)) {
             return Ok((image.clone(), None));
@@ -304,10 +303,8 @@ impl SceneSource for PhotoSource {
             return decode();
         }
         let (image, _) = decode()?;
-        let [width, height] = self.options.min_size;
         let (width, height) = covering_size((image.width, image.height), (width, height));
-        let num_pixels = image.width * image.height;
-        if num_pixels < MIN_DECODED_PIXELS || num_pixels < MIN_DECODED_RATIO * width * height || width * height == 0 {
+        if image.width * image.height < MIN_DECODED_RATIO * width * height || width * height == 0 {
             return Ok((image, None));
         }
         let image = resize_lanczos(&image, width, height);
