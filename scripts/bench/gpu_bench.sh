@@ -18,10 +18,10 @@ max_chunks_mb=10
 # Builds what no variable names, and copies it without symbols.
 pack_binaries() {
     local folder=$1 root=$here/../.. target
-    local spirv=(-p clift -p clift-cube --features clift/vulkan,clift-cube/spirv)
+    local spirv=(-p clift -p clift-cube --features clift/wgpu,clift-cube/spirv)
     target=${CARGO_TARGET_DIR:-$root/target}/release
     build() { (cd "$root" && cargo build --locked --release "$@"); }
-    [ -n "${CLIFT+set}" ] || build --features wgpu
+    [ -n "${CLIFT+set}" ] || build --features wgsl
     [ -z "${CLIFT-built}" ] || strip -o "$folder/clift" "${CLIFT:-$target/clift}"
     # With SPIR-V the program takes the place of the first in the target folder.
     [ -n "${CLIFT_SPIRV+set}" ] || build "${spirv[@]}" --bin clift

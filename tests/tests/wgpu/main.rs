@@ -1,5 +1,5 @@
 //! Results of a GPU (or Mesa's software Vulkan):
-//! `cargo test --release --workspace --features wgpu --test wgpu_suite -- --nocapture` prints the errors.
+//! `cargo test --release --workspace --features wgsl --test wgpu_suite -- --nocapture` prints the errors.
 //!
 //! Without an adapter the tests are skipped; with `CLIFT_REQUIRE_WGPU` set they fail. `clift-cube` tests the kernels one by one.
 

@@ -141,5 +141,22 @@ fn open_wgpu() -> Result<Device, ModelError> {
             return Err(ModelError::NoDevice { name: "wgpu".into(), reason });
         }
     }
+    #[cfg(feature = "spirv")]
+    refuse_old_mesa()?;
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
+}
+
+/// Refuses the software adapter of Mesa before 26, which crashes the process on kernels in SPIR-V.
+#[cfg(feature = "spirv")]
+fn refuse_old_mesa() -> Result<(), ModelError> {
+    let Some(used) = crate::device::adapter::used_adapter().filter(|adapter| adapter.kind == "software") else {
+        return Ok(());
+    };
+    let version =
+        used.driver.split_once("Mesa ").and_then(|(_, version)| version.split('.').next()?.parse::<u32>().ok());
+    if version.is_none_or(|version| version >= 26) {
+        return Ok(());
+    }
+    let reason = format!("{used} crashes on kernels in SPIR-V; install Mesa 26, or build with `--features wgsl`");
+    Err(ModelError::NoDevice { name: "wgpu".into(), reason })
 }

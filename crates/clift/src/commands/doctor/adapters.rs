@@ -7,7 +7,7 @@ use crate::output::units::memory_size;
 
 /// Formats the adapters, or the reason why there are none; `None` in a build without `wgpu`.
 pub fn adapter_text() -> Option<String> {
-    if !cfg!(feature = "wgpu") {
+    if !cfg!(feature = "wgsl") {
         return None;
     }
     // Drivers may panic.

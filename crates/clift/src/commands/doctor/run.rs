@@ -65,9 +65,9 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
 }
 
 fn version() -> String {
-    let devices = [DeviceName::Ndarray, DeviceName::Wgpu].into_iter().filter(|name| name.is_built());
-    let vulkan = cfg!(feature = "vulkan").then_some("vulkan");
-    let features: Vec<&str> = devices.map(DeviceName::as_str).chain(vulkan).collect();
+    let ndarray = DeviceName::Ndarray.is_built().then_some("ndarray");
+    let gpu = DeviceName::Wgpu.is_built().then_some(if cfg!(feature = "wgpu") { "wgpu" } else { "wgsl" });
+    let features: Vec<&str> = ndarray.into_iter().chain(gpu).collect();
     let features = if features.is_empty() { "none".into() } else { features.join(", ") };
     let (os, arch) = (std::env::consts::OS, std::env::consts::ARCH);
     format!("{}, cargo features: {features}, {os} {arch}", env!("CARGO_PKG_VERSION"))

@@ -33,7 +33,7 @@ fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
 const HEAD: &str = "# Numbers on hard scenes
 
 Made by `clift doctor --stability > docs/results/stability.md`, with a column for each device of the
-build (`--features ndarray`, `wgpu`); a small version of every case runs in `cargo test --workspace`.
+build (`--features ndarray`, `wgpu` or `wgsl`); a small version of every case runs in `cargo test --workspace`.
 
 Each case is a real computation in f32, compared with the same code on the same values in f64, which uses the composed
 operations instead of the kernels. The error is the largest difference over the largest value; of an update, over its
