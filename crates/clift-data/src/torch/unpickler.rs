@@ -91,11 +91,11 @@ impl<'a> Unpickler<'a> {
             }
             b'Q' => {
                 let id = self.pop()?;
-                self.push_or_skip(self.storage(id).map(|storage| Value::Storage(Box::new(storage))))?;
+                self.push(self.storage(id).unwrap_or(Value::Opaque))?;
             }
             b'R' => {
                 let (arguments, callee) = (self.pop()?, self.pop()?);
-                self.push_or_skip(self.call(callee, arguments))?;
+                self.push(self.call(callee, arguments).unwrap_or(Value::Opaque))?;
             }
             _ => return self.read_value(opcode),
         }
@@ -220,11 +220,6 @@ impl<'a> Unpickler<'a> {
         Ok(())
     }
 
-    /// Pushes a value, or a skipped object instead of an error.
-    fn push_or_skip(&mut self, value: Result<Value, UnpickleError>) -> Result<(), UnpickleError> {
-        self.push(value.unwrap_or(Value::Opaque))
-    }
-
     fn pop(&mut self) -> Result<ValueId, UnpickleError> {
         let top = self.top()?;
         self.stack.pop();
@@ -319,60 +314,51 @@ impl<'a> Unpickler<'a> {
         Ok(line)
     }
 
-    /// Reads a storage: `("storage", <storage type>, key, device, number of elements)`.
-    fn storage(&self, id: ValueId) -> Result<Storage, UnpickleError> {
-        let Value::Tuple(fields) = self.get(id) else { return Err("a storage that is not a tuple".into()) };
-        let [kind, storage_type, key, _device, num_elements] = fields[..] else {
-            return Err(format!("a storage of {} fields, expected 5", fields.len()).into());
-        };
+    /// Reads a storage, `("storage", <storage type>, key, device, number of elements)`; `None` for anything else, which is
+    /// skipped.
+    fn storage(&self, id: ValueId) -> Option<Value> {
+        let Value::Tuple(fields) = self.get(id) else { return None };
+        let [kind, storage_type, key, _device, num_elements] = fields[..] else { return None };
         match (self.get(kind), self.get(storage_type), self.get(key), self.get(num_elements)) {
             (Value::Str(kind), Value::Global(Global::Storage(element_type)), Value::Str(key), Value::Int(count))
                 if kind == "storage" && key.len() <= MAX_STORAGE_KEY_BYTES && *count >= 0 =>
             {
-                Ok(Storage { element_type: *element_type, key: key.clone() })
+                Some(Value::Storage(Box::new(Storage { element_type: *element_type, key: key.clone() })))
             }
-            _ => Err("a storage whose fields are not (\"storage\", type, name, device, count)".into()),
+            _ => None,
         }
     }
 
-    /// Evaluates a call of an allowed name; these calls only describe data.
-    fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, UnpickleError> {
-        let Value::Tuple(arguments) = self.get(arguments) else {
-            return Err("a call whose arguments are not a tuple".into());
-        };
+    /// Evaluates a call of an allowed name; these calls only describe data. `None` for any other call, which is skipped.
+    fn call(&self, callee: ValueId, arguments: ValueId) -> Option<Value> {
+        let Value::Tuple(arguments) = self.get(arguments) else { return None };
         match (self.get(callee), &arguments[..]) {
-            (Value::Global(Global::OrderedDict), []) => Ok(Value::Dict(Vec::new())),
+            (Value::Global(Global::OrderedDict), []) => Some(Value::Dict(Vec::new())),
             (Value::Global(Global::RebuildTensor), [storage, offset, shape, stride, ..]) => {
                 let (Value::Storage(storage), Value::Int(offset)) = (self.get(*storage), self.get(*offset)) else {
-                    return Err("a tensor without a storage".into());
+                    return None;
                 };
-                let offset =
-                    u64::try_from(*offset).map_err(|_| UnpickleError::from("a tensor with a negative offset"))?;
+                let (storage, offset) = ((**storage).clone(), u64::try_from(*offset).ok()?);
                 let (shape, stride) = (self.counts(*shape)?, self.counts(*stride)?);
-                if shape.len() != stride.len() {
-                    return Err("a tensor with more sizes than strides, or fewer".into());
-                }
-                Ok(Value::Tensor(Box::new(Tensor { storage: (**storage).clone(), offset, shape, stride })))
+                let is_tensor = shape.len() == stride.len();
+                is_tensor.then(|| Value::Tensor(Box::new(Tensor { storage, offset, shape, stride })))
             }
             (Value::Global(Global::RebuildParameter), [data, ..]) => match self.get(*data) {
-                Value::Tensor(tensor) => Ok(Value::Tensor(tensor.clone())),
-                _ => Err("a parameter without a tensor".into()),
+                Value::Tensor(tensor) => Some(Value::Tensor(tensor.clone())),
+                _ => None,
             },
-            _ => Err("a call of something other than a tensor or an empty OrderedDict".into()),
+            _ => None,
         }
     }
 
     /// Reads a tuple of at most [`MAX_DIMENSIONS`] non-negative integers.
-    fn counts(&self, id: ValueId) -> Result<Vec<u64>, UnpickleError> {
-        let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are not a tuple".into()) };
-        if items.len() > MAX_DIMENSIONS {
-            return Err(format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len()).into());
-        }
+    fn counts(&self, id: ValueId) -> Option<Vec<u64>> {
+        let Value::Tuple(items) = self.get(id) else { return None };
         let count = |id: &ValueId| match self.get(*id) {
-            Value::Int(count) => u64::try_from(*count).map_err(|_| "a tensor with a negative size or stride".into()),
-            _ => Err("a tensor with a size or stride that is not an integer".into()),
+            Value::Int(count) => u64::try_from(*count).ok(),
+            _ => None,
         };
-        items.iter().map(count).collect()
+        if items.len() > MAX_DIMENSIONS { None } else { items.iter().map(count).collect() }
     }
 }
 
@@ -390,28 +376,20 @@ impl<S: Into<String>> From<S> for UnpickleError {
 
 /// Looks a Python name up in the allow-list; `None` for a name whose objects are skipped.
 pub(crate) fn global(module: &str, name: &str) -> Result<Option<Global>, UnpickleError> {
-    let known = match (module, name) {
-        ("torch._utils", "_rebuild_tensor_v2") => Some(Global::RebuildTensor),
-        ("collections", "OrderedDict") => Some(Global::OrderedDict),
-        ("torch", "ByteStorage") => Some(Global::Storage(ElementType::U8)),
-        ("torch", "IntStorage") => Some(Global::Storage(ElementType::I32)),
-        ("torch", "LongStorage") => Some(Global::Storage(ElementType::I64)),
-        ("torch", "FloatStorage") => Some(Global::Storage(ElementType::F32)),
-        ("torch", "DoubleStorage") => Some(Global::Storage(ElementType::F64)),
-        _ => None,
-    };
-    if known.is_some() {
-        return Ok(known);
-    }
-    if is_attack(module, name) {
-        return Err(UnpickleError::Refused(escaped_name(module, name)));
-    }
-    Ok(match (module, name) {
-        ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Some(Global::RebuildParameter),
-        ("torch", "HalfStorage") => Some(Global::Storage(ElementType::F16)),
-        ("torch", "BFloat16Storage") => Some(Global::Storage(ElementType::BF16)),
-        _ => None,
-    })
+    Ok(Some(match (module, name) {
+        ("torch._utils", "_rebuild_tensor_v2") => Global::RebuildTensor,
+        ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Global::RebuildParameter,
+        ("collections", "OrderedDict") => Global::OrderedDict,
+        ("torch", "ByteStorage") => Global::Storage(ElementType::U8),
+        ("torch", "IntStorage") => Global::Storage(ElementType::I32),
+        ("torch", "LongStorage") => Global::Storage(ElementType::I64),
+        ("torch", "FloatStorage") => Global::Storage(ElementType::F32),
+        ("torch", "DoubleStorage") => Global::Storage(ElementType::F64),
+        ("torch", "HalfStorage") => Global::Storage(ElementType::F16),
+        ("torch", "BFloat16Storage") => Global::Storage(ElementType::BF16),
+        _ if is_attack(module, name) => return Err(UnpickleError::Refused(escaped_name(module, name))),
+        _ => return Ok(None),
+    }))
 }
 
 /// Formats a name of a possibly hostile file: at most 120 characters, without control characters.
