@@ -27,13 +27,9 @@ pub(crate) fn require_file(path: &Path) -> Result<(), DataError> {
     Ok(())
 }
 
-/// Returns a description of a file that is not a ZIP archive; `None` for an unknown format.
+/// Returns a description of a file that is not a ZIP archive; `None` if the format is unknown or a ZIP archive.
 pub(crate) fn other_format(path: &Path) -> Option<&'static str> {
-    other_kind(&read_start(path, NUM_BYTES)?, std::fs::metadata(path).ok()?.len())
-}
-
-/// Returns a description of a file with this start; `None` if the format is unknown or a ZIP archive.
-fn other_kind(start: &[u8], num_bytes: u64) -> Option<&'static str> {
+    let (start, num_bytes) = (read_start(path, NUM_BYTES)?, std::fs::metadata(path).ok()?.len());
     let text = start.trim_ascii_start().to_ascii_lowercase();
     if start.is_empty() {
         return Some("an empty file; download it again");
@@ -46,7 +42,7 @@ fn other_kind(start: &[u8], num_bytes: u64) -> Option<&'static str> {
              use it only for files that you trust)",
         );
     }
-    if matches!(start, [0x80, 2..=5, ..]) {
+    if matches!(start[..], [0x80, 2..=5, ..]) {
         return Some("a plain pickle, not written by torch.save; load it in Python and torch.save its state dict");
     }
     let header = start.first_chunk().map(|length| u64::from_le_bytes(*length));

@@ -146,16 +146,10 @@ impl SceneTable {
         self.images = self.usable(images);
     }
 
-    fn is_usable(&self, frame: usize) -> bool {
-        self.unusable.binary_search_by_key(&frame, |(frame, _)| *frame).is_err()
-    }
-
     /// Keeps the values of the usable frames, of values for all frames of the file.
     fn usable<T>(&self, values: Vec<T>) -> Vec<T> {
-        if self.unusable.is_empty() {
-            return values;
-        }
-        values.into_iter().enumerate().filter(|(frame, _)| self.is_usable(*frame)).map(|(_, value)| value).collect()
+        let is_usable = |frame: usize| self.unusable.binary_search_by_key(&frame, |(frame, _)| *frame).is_err();
+        values.into_iter().enumerate().filter(|(frame, _)| is_usable(*frame)).map(|(_, value)| value).collect()
     }
 
     fn read_rows(&self, path: &Path) -> Result<Vec<[f64; 18]>, DataError> {
@@ -168,12 +162,8 @@ impl SceneTable {
     }
 
     pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> {
-        let camera = |row: &[f64; 18]| {
-            camera_of_row(*row).map(|(camera, _)| camera).map_err(|source| DataError::BadChunk {
-                what: format!("scene {}: {source}", self.key),
-                path: path.to_path_buf(),
-            })
-        };
-        self.usable(self.read_rows(path)?).iter().map(camera).collect()
+        let bad = |error| DataError::BadChunk { what: format!("scene {}: {error}", self.key), path: path.into() };
+        let camera = |row| camera_of_row(row).map(|(camera, _)| camera).map_err(bad);
+        self.usable(self.read_rows(path)?).into_iter().map(camera).collect()
     }
 }

@@ -110,10 +110,6 @@ pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>
         write_scene(scene, &mut pickle);
     }
     pickle.raw(b"e.");
-    pack(path, pickle)
-}
-
-fn pack(path: &Path, pickle: PickleWriter) -> Result<Vec<u8>, DataError> {
     let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
     pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))
 }
