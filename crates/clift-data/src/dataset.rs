@@ -95,10 +95,9 @@ pub fn open_training_dataset(
     if short.is_empty() {
         return Ok(opened);
     }
+    let reason = format!("shorter than the {needed} frames that data.views.min_gap needs");
     for scene in short {
-        opened
-            .report
-            .skip(source.key(scene), format!("shorter than the {needed} frames that data.views.min_gap needs"));
+        opened.report.skip(source.key(scene), &reason);
     }
     if long.is_empty() {
         return Err(DataError::NoScenes { reason: format!("{}: {}", Split::Train, opened.report) });

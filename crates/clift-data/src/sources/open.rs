@@ -160,10 +160,8 @@ impl SplitFolder<'_> {
             let mut candidates = folders.iter().map(|folder| folder.join(key));
             let frames =
                 candidates.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path.join("frames").join(key));
-            Some(SceneFolder {
-                key: key.into(),
-                files: SceneFiles::Re10kText { cameras: self.base.join(name), frames },
-            })
+            let files = SceneFiles::Re10kText { cameras: self.base.join(name), frames };
+            Some(SceneFolder { key: key.into(), files })
         };
         Ok(names.iter().filter_map(clip).collect())
     }

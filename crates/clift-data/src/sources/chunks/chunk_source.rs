@@ -115,13 +115,9 @@ impl ChunkSource {
     }
 
     fn read_encoded(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
-        let (path, table) = self.table(scene)?;
-        let span = table.images.get(frame).ok_or_else(|| DataError::NoSuchFrame {
-            key: table.key.clone(),
-            frame,
-            num_frames: table.images.len(),
-        })?;
-        span.read(path)
+        let (path, SceneTable { key, images, .. }) = self.table(scene)?;
+        let missing = || DataError::NoSuchFrame { key: key.clone(), frame, num_frames: images.len() };
+        images.get(frame).ok_or_else(missing)?.read(path)
     }
 
     /// Reads the tables of all readable chunks; with a chunk index cache at `path`, of changed ones, and updates the cache. An

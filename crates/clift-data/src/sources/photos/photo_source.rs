@@ -168,11 +168,8 @@ impl PhotoSource {
 
     fn photo(&self, scene: usize, frame: usize) -> Result<Photo, DataError> {
         let photos = &self.scene(scene)?.photos;
-        photos.get(frame).cloned().ok_or_else(|| DataError::NoSuchFrame {
-            key: self.key(scene).to_owned(),
-            frame,
-            num_frames: photos.len(),
-        })
+        let (key, num_frames) = (self.key(scene), photos.len());
+        photos.get(frame).cloned().ok_or_else(|| DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames })
     }
 }
 
