@@ -7,22 +7,15 @@ use std::path::Path;
 use crate::error::DataError;
 use crate::files::listing::decode_name;
 use crate::geometry::lens::MODELS;
-use crate::sources::photos::colmap::model::{Cameras, ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera};
+use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model};
 
 /// Bytes of an image point: two coordinates and the id of the 3D point.
 const POINT_BYTES: u64 = 24;
 
-/// Reads `cameras.bin` and `images.bin`.
-pub(crate) fn read(cameras: &Path, images: &Path) -> Result<Model, DataError> {
-    let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
-    read_images(images, &mut model)?;
-    Ok(model)
-}
-
-fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
+/// Reads `cameras.bin`.
+pub(crate) fn read_cameras(path: &Path, read: &mut Model) -> Result<(), DataError> {
     let mut file = Fields::open(path)?;
     let count = u64::from_le_bytes(file.take()?);
-    let mut cameras = Cameras::new();
     for index in 0..count {
         let id = u32::from_le_bytes(file.take()?);
         let model = i32::from_le_bytes(file.take()?);
@@ -34,12 +27,13 @@ fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
             .ok_or_else(|| file.bad(format!("camera {index} of {count} has the unknown model {model}")))?;
         let params = (0..num_focal + 2 + num_distortion).map(|_| file.take().map(f64::from_le_bytes));
         let camera = ColmapCamera { model: name.into(), width, height, params: params.collect::<Result<_, _>>()? };
-        add_camera(&mut cameras, id, Ok(camera)).map_err(|what| file.bad(what))?;
+        read.add_camera(id, Ok(camera)).map_err(|what| file.bad(what))?;
     }
-    Ok(cameras)
+    Ok(())
 }
 
-fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
+/// Reads `images.bin`.
+pub(crate) fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
     let mut file = Fields::open(path)?;
     let count = u64::from_le_bytes(file.take()?);
     for _ in 0..count {

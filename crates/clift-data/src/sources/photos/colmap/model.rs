@@ -73,28 +73,27 @@ impl ColmapImage {
     }
 }
 
-/// Cameras by id, or what is wrong with their entries: a camera that no image uses may be malformed.
-pub(crate) type Cameras = HashMap<u32, Result<ColmapCamera, String>>;
-
-/// Cameras, images in file order, and names and reasons of the images that are malformed.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Model {
-    pub cameras: Cameras,
+    /// Cameras by id, or what is wrong with their entries: a camera that no image uses may be malformed.
+    pub cameras: HashMap<u32, Result<ColmapCamera, String>>,
+    /// Images in file order.
     pub images: Vec<ColmapImage>,
+    /// Names and reasons of the images that are malformed.
     pub malformed: Vec<(String, String)>,
 }
 
-/// Adds a camera; refuses more than [`MAX_CAMERAS`].
-pub(crate) fn add_camera(cameras: &mut Cameras, id: u32, camera: Result<ColmapCamera, String>) -> Result<(), String> {
-    if cameras.len() == MAX_CAMERAS {
-        return Err(format!("more than {MAX_CAMERAS} cameras"));
-    }
-    let twice = || Err("its id occurs twice".into());
-    cameras.entry(id).and_modify(|first| *first = twice()).or_insert(camera);
-    Ok(())
-}
-
 impl Model {
+    /// Adds a camera; refuses more than [`MAX_CAMERAS`].
+    pub fn add_camera(&mut self, id: u32, camera: Result<ColmapCamera, String>) -> Result<(), String> {
+        if self.cameras.len() == MAX_CAMERAS {
+            return Err(format!("more than {MAX_CAMERAS} cameras"));
+        }
+        let twice = || Err("its id occurs twice".into());
+        self.cameras.entry(id).and_modify(|first| *first = twice()).or_insert(camera);
+        Ok(())
+    }
+
     /// Adds an image, or its name and why it is malformed; refuses more than [`MAX_FRAMES`].
     pub fn add_image(&mut self, image: Result<ColmapImage, (String, String)>) -> Result<(), String> {
         if self.images.len() + self.malformed.len() == MAX_FRAMES {

@@ -65,8 +65,15 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         let what = "expected cameras.bin and images.bin, or cameras.txt and images.txt".into();
         return Err(DataError::BadScene { what, path: model.to_owned() });
     };
-    let read = if is_binary { binary::read } else { text::read };
-    let Model { cameras, mut images, malformed } = read(&cameras_path, &images_path)?;
+    let mut read = Model::default();
+    if is_binary {
+        binary::read_cameras(&cameras_path, &mut read)?;
+        binary::read_images(&images_path, &mut read)?;
+    } else {
+        text::read_cameras(&cameras_path, &mut read)?;
+        text::read_images(&images_path, &mut read)?;
+    }
+    let Model { cameras, mut images, malformed } = read;
     images.sort_by(|a, b| natural_order(&a.name, &b.name));
     let mut locator = ImageLocator::for_model(folder, model, options);
     let mut scene = PhotoScene::default();

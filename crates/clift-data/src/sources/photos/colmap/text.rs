@@ -7,20 +7,13 @@ use std::str::FromStr;
 
 use crate::error::DataError;
 use crate::files::listing::decode_name;
-use crate::sources::photos::colmap::model::{Cameras, ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera};
+use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model};
 
 /// Largest number of stored bytes of a line; lines of points may be longer, and their rest is skipped.
 const MAX_LINE_BYTES: usize = MAX_NAME_BYTES + 1024;
 
-/// Reads `cameras.txt` and `images.txt`.
-pub(crate) fn read(cameras: &Path, images: &Path) -> Result<Model, DataError> {
-    let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
-    read_images(images, &mut model)?;
-    Ok(model)
-}
-
-fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
-    let mut cameras = Cameras::new();
+/// Reads `cameras.txt`.
+pub(crate) fn read_cameras(path: &Path, read: &mut Model) -> Result<(), DataError> {
     let mut lines = Lines::open(path)?;
     while let Some(line) = lines.next_entry()? {
         let mut words = line.split_ascii_whitespace();
@@ -34,12 +27,13 @@ fn read_cameras(path: &Path) -> Result<Cameras, DataError> {
             Ok(ColmapCamera { model, width, height, params })
         })();
         let camera = camera.map_err(|what: String| format!("line {}: {what}", lines.number));
-        add_camera(&mut cameras, id, camera).map_err(|what| lines.bad(&what))?;
+        read.add_camera(id, camera).map_err(|what| lines.bad(&what))?;
     }
-    Ok(cameras)
+    Ok(())
 }
 
-fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
+/// Reads `images.txt`.
+pub(crate) fn read_images(path: &Path, read: &mut Model) -> Result<(), DataError> {
     let mut lines = Lines::open(path)?;
     while let Some(line) = lines.next_entry()? {
         let image = parse_image(&line).map_err(|what| {
