@@ -140,65 +140,40 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
-        match self.poses(source, scene)? {
-            None => self.sample_frames(source.num_frames(scene)?, step, num_context, rng),
-            Some(poses) => self.sample_nearest(&poses, step, num_context, rng),
-        }
+        let poses = self.poses(source, scene)?;
+        let num_frames = poses.as_ref().map_or_else(|| source.num_frames(scene), |poses| Ok(poses.len()))?;
+        self.sample_frames(num_frames, poses.as_deref(), step, num_context, rng)
     }
 
-    /// Samples the views of one item among a frame and those nearest to it: as many as a range has.
-    fn sample_nearest(
-        &self,
-        poses: &[Pose],
-        step: u64,
-        num_context: usize,
-        rng: &mut impl Rng,
-    ) -> Result<ViewIndices, DataError> {
-        let gap = self.sample_gap(poses.len(), step, num_context, rng)?;
-        let seed = uniform_below(rng, poses.len());
-        let frames = ViewDistance::new(poses).nearest(poses, seed, gap + 1);
-        let ViewIndices { context, target } = self.sample_between(0, gap, num_context, rng);
-        let of_scene = |positions: Vec<usize>| positions.into_iter().map(|position| frames[position]).collect();
-        Ok(ViewIndices { context: of_scene(context), target: of_scene(target) })
-    }
-
-    /// Samples the views of one item from a scene of `num_frames` frames.
+    /// Samples the views of one item from a scene of `num_frames` frames: among consecutive ones or, of a scene with
+    /// `poses`, among a frame and those nearest to it, as many as a range has.
     ///
     /// The contexts are distinct and sorted. The targets lie between the ends, inclusive, in the sampled order. Expects
     /// a sampler that passes [`validate`](Self::validate).
-    pub(crate) fn sample_frames(
+    fn sample_frames(
         &self,
         num_frames: usize,
+        poses: Option<&[Pose]>,
         step: u64,
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
-        let gap = self.sample_gap(num_frames, step, num_context, rng)?;
-        let left = uniform_below(rng, num_frames - gap);
-        Ok(self.sample_between(left, left + gap, num_context, rng))
-    }
-
-    /// Samples the gap of an item from a scene of `num_frames` frames, and checks that it can have one.
-    fn sample_gap(
-        &self,
-        num_frames: usize,
-        step: u64,
-        num_context: usize,
-        rng: &mut impl Rng,
-    ) -> Result<usize, DataError> {
         let [min_gap, max_gap] = self.gap_bounds(step, num_context);
         if num_frames <= min_gap {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });
         }
-        Ok(uniform_between(rng, min_gap, max_gap.min(num_frames - 1)))
-    }
-
-    fn sample_between(&self, left: usize, right: usize, num_context: usize, rng: &mut impl Rng) -> ViewIndices {
-        let target = (0..self.num_targets).map(|_| uniform_between(rng, left, right)).collect();
-        let inner = sample_distinct(rng, right - left - 1, num_context - 2);
-        let inner = inner.into_iter().map(|offset| left + 1 + offset);
-        let context = std::iter::once(left).chain(inner).chain([right]).collect();
-        ViewIndices { context, target }
+        let gap = uniform_between(rng, min_gap, max_gap.min(num_frames - 1));
+        let frames: Vec<usize> = if let Some(poses) = poses {
+            let seed = uniform_below(rng, num_frames);
+            ViewDistance::new(poses).nearest(poses, seed, gap + 1)
+        } else {
+            let left = uniform_below(rng, num_frames - gap);
+            (left..=left + gap).collect()
+        };
+        let target = (0..self.num_targets).map(|_| frames[uniform_below(rng, gap + 1)]).collect();
+        let inner = sample_distinct(rng, gap - 1, num_context - 2).into_iter().map(|offset| frames[offset + 1]);
+        let context = std::iter::once(frames[0]).chain(inner).chain([frames[gap]]).collect();
+        Ok(ViewIndices { context, target })
     }
 
     /// Samples the targets of stage 2 for stored contexts: frames between the first and the last context or, with

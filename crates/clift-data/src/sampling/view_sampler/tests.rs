@@ -12,7 +12,7 @@ fn sampler() -> ViewSampler {
 // The expected values come from an implementation of this sampler in Python.
 #[test]
 fn samples_are_reproducible() {
-    let views = sampler().sample_frames(279, 1_500, 6, &mut item_rng(7, 1_500, 3, 0, "views")).unwrap();
+    let views = sampler().sample_frames(279, None, 1_500, 6, &mut item_rng(7, 1_500, 3, 0, "views")).unwrap();
     assert_eq!(views.context, [168, 189, 195, 202, 204, 208]);
     assert_eq!(views.target, [170, 196, 205, 194, 172, 203]);
 }
@@ -61,7 +61,7 @@ fn nearest_frames_are_neighbours_in_space_in_any_order() {
     let gaps = ViewSampler { min_gap: [8, 8], max_gap: [8, 8], warm_up_steps: 0, ..sampler() };
     for seed in 0..50 {
         let mut rng = item_rng(seed, 0, 0, 0, "test");
-        let ViewIndices { context, target } = gaps.sample_nearest(&poses, 0, 6, &mut rng).unwrap();
+        let ViewIndices { context, target } = gaps.sample_frames(40, Some(&poses), 0, 6, &mut rng).unwrap();
         assert!(context.len() == 6 && target.len() == 6 && context.is_sorted_by(|a, b| a < b), "{context:?}");
         let places: BTreeSet<usize> = context.iter().chain(&target).map(|&frame| place(frame)).collect();
         assert!(places.last().unwrap() - places.first().unwrap() <= 8, "{places:?}");
@@ -70,7 +70,7 @@ fn nearest_frames_are_neighbours_in_space_in_any_order() {
         assert!(targets.iter().all(|frame| !context.contains(frame)));
         assert!(targets.iter().all(|&frame| places.iter().any(|near| near.abs_diff(place(frame)) <= 4)), "{targets:?}");
     }
-    assert!(gaps.sample_nearest(&poses[..8], 0, 6, &mut item_rng(0, 0, 0, 0, "test")).is_err());
+    assert!(gaps.sample_frames(8, Some(&poses[..8]), 0, 6, &mut item_rng(0, 0, 0, 0, "test")).is_err());
 }
 
 proptest! {
@@ -88,7 +88,8 @@ proptest! {
         let divisor = 8 / num_context;
         let (min_gap, max_gap) = (low / divisor, high / divisor);
         let mut rng = item_rng(seed, step, 0, 0, "test");
-        let Ok(ViewIndices { context, target }) = sampler.sample_frames(num_frames, step, num_context, &mut rng) else {
+        let sampled = sampler.sample_frames(num_frames, None, step, num_context, &mut rng);
+        let Ok(ViewIndices { context, target }) = sampled else {
             prop_assert!(num_frames <= min_gap);
             return Ok(());
         };
