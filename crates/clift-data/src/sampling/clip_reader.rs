@@ -4,9 +4,7 @@ use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::sync::Arc;
 
-use clift_core::{
-    Camera, ClipViews, IntrinsicsNorm, Pose, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near,
-};
+use clift_core::{Camera, ClipViews, IntrinsicsNorm, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near};
 
 use crate::error::DataError;
 use crate::image::fit::fit_image;
@@ -113,15 +111,22 @@ impl ClipReader {
         cameras: &[Camera<IntrinsicsNorm>],
         normalization: &PoseNormalization,
     ) -> Result<HashMap<usize, FittedFrame>, DataError> {
+        let (key, ClipOptions { width, height, .. }) = (self.source.key(scene), self.options);
         let c2w = |frame: usize| normalization.normalize(cameras[frame].c2w);
         for &frame in frames {
-            check_near(&c2w(frame)).map_err(DataError::in_frame(self.source.key(scene), frame))?;
+            check_near(&c2w(frame)).map_err(DataError::in_frame(key, frame))?;
         }
         let mut fitted = HashMap::new();
         for &frame in frames {
-            if let Entry::Vacant(entry) = fitted.entry(frame) {
-                entry.insert(self.fit_frame(scene, frame, cameras[frame].intrinsics, c2w(frame))?);
-            }
+            let Entry::Vacant(entry) = fitted.entry(frame) else { continue };
+            let fit = |image: &RgbImage| {
+                fit_image(image, cameras[frame].intrinsics, width, height).map_err(DataError::in_frame(key, frame))
+            };
+            let (image, coverage) = self.source.frame_with_coverage(scene, frame)?;
+            let weights = coverage.map(|coverage| fit(&coverage)).transpose()?;
+            let weights = weights.map(|(coverage, _)| coverage.rgb.into_iter().step_by(3).collect());
+            let (image, intrinsics) = fit(&image)?;
+            entry.insert(FittedFrame { image, camera: Camera { c2w: c2w(frame), intrinsics }, weights });
         }
         Ok(fitted)
     }
@@ -134,24 +139,6 @@ impl ClipReader {
             cameras: frames.iter().map(|frame| fitted[frame].camera).collect(),
             frame_index: frames.to_vec(),
         }
-    }
-
-    fn fit_frame(
-        &self,
-        scene: usize,
-        frame: usize,
-        intrinsics: IntrinsicsNorm,
-        c2w: Pose,
-    ) -> Result<FittedFrame, DataError> {
-        let ClipOptions { width, height, .. } = self.options;
-        let fit = |image: &RgbImage| {
-            fit_image(image, intrinsics, width, height).map_err(DataError::in_frame(self.source.key(scene), frame))
-        };
-        let (image, coverage) = self.source.frame_with_coverage(scene, frame)?;
-        let weights = coverage.map(|coverage| fit(&coverage)).transpose()?;
-        let weights = weights.map(|(coverage, _)| coverage.rgb.into_iter().step_by(3).collect());
-        let (image, intrinsics) = fit(&image)?;
-        Ok(FittedFrame { image, camera: Camera { c2w, intrinsics }, weights })
     }
 }
 
@@ -167,6 +154,7 @@ mod tests {
     use super::*;
     use crate::scene_source::Split;
     use crate::testing::{TestSource, re10k_mini};
+    use clift_core::Pose;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     fn options() -> ClipOptions {

@@ -38,11 +38,6 @@ impl SceneOrder {
         self.permuted((position / num_scenes) as u64, (position % num_scenes) as u64) as usize
     }
 
-    #[cfg(test)]
-    pub fn batch_size(&self) -> usize {
-        self.batch_size as usize
-    }
-
     fn permuted(&self, epoch: u64, position: u64) -> u64 {
         let key = mix(self.seed ^ mix(epoch));
         let mut value = position;

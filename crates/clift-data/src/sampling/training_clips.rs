@@ -64,7 +64,9 @@ impl TrainingClips {
                 continue;
             }
             attempts += 1;
-            match self.read_scene(scene, step, slot, ahead, num_context) {
+            let mut rng = item_rng(self.seed, step, slot as u32, ahead, "views");
+            let views = self.sampler.sample(source.as_ref(), scene, step, num_context, &mut rng);
+            match views.and_then(|views| self.reader.read(scene, &views)) {
                 Ok(clip) => return Ok(clip),
                 Err(error) => {
                     skipped.push(SkippedScene { key: source.key(scene).into(), reason: error.to_string() });
@@ -74,19 +76,6 @@ impl TrainingClips {
         let last = skipped.last().map(|SkippedScene { key, reason }| (key.clone(), reason.clone()));
         let (key, reason) = last.unwrap_or_default();
         Err(DataError::NoUsableScene { step, slot, attempts, key, reason })
-    }
-
-    fn read_scene(
-        &self,
-        scene: usize,
-        step: u64,
-        slot: usize,
-        attempt: u32,
-        num_context: usize,
-    ) -> Result<Clip, DataError> {
-        let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
-        let views = self.sampler.sample(self.reader.source.as_ref(), scene, step, num_context, &mut rng)?;
-        self.reader.read(scene, &views)
     }
 }
 
@@ -103,10 +92,9 @@ mod tests {
         TrainingClips::new(reader, ViewSampler::default(), batch_size, seed).unwrap()
     }
 
-    fn batch(clips: &TrainingClips, step: u64) -> Result<(Vec<Clip>, Vec<SkippedScene>), DataError> {
+    fn batch(clips: &TrainingClips, size: usize, step: u64) -> Result<(Vec<Clip>, Vec<SkippedScene>), DataError> {
         let mut skipped = Vec::new();
-        let slots = 0..clips.order.batch_size();
-        let read = slots.map(|slot| clips.slot(step, slot, &mut skipped)).collect::<Result<_, _>>()?;
+        let read = (0..size).map(|slot| clips.slot(step, slot, &mut skipped)).collect::<Result<_, _>>()?;
         Ok((read, skipped))
     }
 
@@ -125,7 +113,7 @@ mod tests {
         };
         let mut checksum = crc32fast::Hasher::new();
         for step in 0..1000 {
-            let line = batch(&clips, step).map_or_else(|error| error.to_string(), |batch| line(step, batch));
+            let line = batch(&clips, 8, step).map_or_else(|error| error.to_string(), |batch| line(step, batch));
             checksum.update(format!("{line}\n").as_bytes());
         }
         assert_eq!(checksum.finalize(), 0x931e_f689);
@@ -133,13 +121,13 @@ mod tests {
 
     #[test]
     fn slot_fails_after_64_scenes_or_16_attempts() {
-        let attempts = |num_scenes| match batch(&clips(vec![10; num_scenes], 1, 9), 0) {
+        let attempts = |num_scenes| match batch(&clips(vec![10; num_scenes], 1, 9), 1, 0) {
             Err(DataError::NoUsableScene { attempts, .. }) => attempts,
             other => panic!("{other:?}"),
         };
         assert_eq!([attempts(1), attempts(1000)], [16, 64]);
         assert!((40..=56).contains(&attempts(40)), "{} attempts for 40 scenes", attempts(40));
-        let error = batch(&clips(vec![10; 40], 4, 9), 2).unwrap_err().to_string();
+        let error = batch(&clips(vec![10; 40], 4, 9), 4, 2).unwrap_err().to_string();
         assert!(error.starts_with("no usable scene for slot 0 of step 2 in "), "{error}");
         assert!(error.ends_with(": not enough frames: 26 needed, 10 in the scene"), "{error}");
     }
