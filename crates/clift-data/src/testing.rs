@@ -1,7 +1,6 @@
 //! Files and data sources for tests.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use clift_core::{Camera, IntrinsicsNorm, Pose, RgbImage};
 
@@ -47,33 +46,9 @@ type ReadFrame = dyn Fn(&dyn SceneSource, usize, usize) -> Result<RgbImage, Data
 
 /// The scenes of another source, with the cameras and frames of functions of a test, which receive that source.
 pub struct TestSource {
-    base: Arc<dyn SceneSource>,
-    cameras: Box<ReadCameras>,
-    frame: Box<ReadFrame>,
-}
-
-impl TestSource {
-    pub fn new(base: impl SceneSource + 'static) -> Self {
-        Self {
-            base: Arc::new(base),
-            cameras: Box::new(|base, scene| base.cameras(scene)),
-            frame: Box::new(|base, scene, frame| base.frame(scene, frame)),
-        }
-    }
-
-    pub fn with_cameras(
-        self,
-        read: impl Fn(&dyn SceneSource, usize) -> Result<Vec<Camera<IntrinsicsNorm>>, DataError> + Send + Sync + 'static,
-    ) -> Self {
-        Self { cameras: Box::new(read), ..self }
-    }
-
-    pub fn with_frames(
-        self,
-        read: impl Fn(&dyn SceneSource, usize, usize) -> Result<RgbImage, DataError> + Send + Sync + 'static,
-    ) -> Self {
-        Self { frame: Box::new(read), ..self }
-    }
+    pub base: Box<dyn SceneSource>,
+    pub cameras: Box<ReadCameras>,
+    pub frame: Box<ReadFrame>,
 }
 
 impl SceneSource for TestSource {
@@ -98,14 +73,27 @@ impl SceneSource for TestSource {
     }
 }
 
+/// Rooms of eight frames. The cameras of the second scene cannot be read.
+pub fn rooms_with_a_broken_one(num_scenes: usize) -> TestSource {
+    TestSource {
+        base: Box::new(rooms(|c| (c.num_scenes, c.num_frames) = (num_scenes, 8))),
+        cameras: Box::new(|base, scene| match scene {
+            1 => Err(DataError::bad_camera("the pose holds NaN".into())),
+            _ => base.cameras(scene),
+        }),
+        frame: Box::new(|base, scene, frame| base.frame(scene, frame)),
+    }
+}
+
 /// Scenes with given numbers of frames of one pixel. The camera moves along the negative x axis, so that the first context
 /// of a clip is normalised to a positive x.
 pub fn scenes_of_lengths(lengths: Vec<usize>) -> TestSource {
     let intrinsics = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
     let at = |frame: usize| Pose { translation: [-(frame as f64), 0.0, 0.0].into(), ..Pose::IDENTITY };
-    TestSource::new(rooms(|c| c.num_scenes = lengths.len()))
-        .with_cameras(move |_, scene| {
-            Ok((0..lengths[scene]).map(|frame| Camera { c2w: at(frame), intrinsics }).collect())
-        })
-        .with_frames(|_, _, _| Ok(RgbImage { width: 1, height: 1, rgb: vec![0; 3] }))
+    let camera = move |frame: usize| Camera { c2w: at(frame), intrinsics };
+    TestSource {
+        base: Box::new(rooms(|c| c.num_scenes = lengths.len())),
+        cameras: Box::new(move |_, scene| Ok((0..lengths[scene]).map(camera).collect())),
+        frame: Box::new(|_, _, _| Ok(RgbImage { width: 1, height: 1, rgb: vec![0; 3] })),
+    }
 }

@@ -165,16 +165,18 @@ mod tests {
     fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<AtomicUsize>) {
         let num_decoded = Arc::new(AtomicUsize::new(0));
         let counter = num_decoded.clone();
-        let source = TestSource::new(re10k_mini(Split::Test))
-            .with_cameras(move |base, scene| {
+        let source = TestSource {
+            base: Box::new(re10k_mini(Split::Test)),
+            cameras: Box::new(move |base, scene| {
                 let mut cameras = base.cameras(scene)?;
                 cameras[4].c2w = frame_4.unwrap_or(cameras[4].c2w);
                 Ok(cameras)
-            })
-            .with_frames(move |base, scene, frame| {
+            }),
+            frame: Box::new(move |base, scene, frame| {
                 counter.fetch_add(1, Ordering::Relaxed);
                 base.frame(scene, frame)
-            });
+            }),
+        };
         (ClipReader { source: Arc::new(source), options }, num_decoded)
     }
 

@@ -175,7 +175,7 @@ pub fn even_views_of(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{TestSource, read_from_file, rooms};
+    use crate::testing::{read_from_file, rooms_with_a_broken_one};
 
     fn index(json: &str) -> Result<EvaluationIndex, DataError> {
         read_from_file("index.json", json, EvaluationIndex::read)
@@ -211,9 +211,7 @@ mod tests {
 
     #[test]
     fn unusable_entries_are_skipped_up_to_the_limit() {
-        let broken = || DataError::bad_camera("the pose holds NaN".into());
-        let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (5, 8)))
-            .with_cameras(move |base, scene| if scene == 1 { Err(broken()) } else { base.cameras(scene) });
+        let source = rooms_with_a_broken_one(5);
         let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8
         let entries: Vec<String> = (0..5)
             .map(|scene| {

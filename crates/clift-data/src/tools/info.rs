@@ -73,13 +73,11 @@ fn extent(cameras: &[Camera<IntrinsicsNorm>]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{TestSource, rooms};
+    use crate::testing::rooms_with_a_broken_one;
 
     #[test]
     fn unreadable_scene_is_named_and_the_others_are_summarised() {
-        let broken = || DataError::bad_camera("the pose holds NaN".into());
-        let source = TestSource::new(rooms(|c| (c.num_scenes, c.num_frames) = (3, 8)))
-            .with_cameras(move |base, scene| if scene == 1 { Err(broken()) } else { base.cameras(scene) });
+        let source = rooms_with_a_broken_one(3);
         let info = SourceInfo::read(&source);
         assert_eq!((info.num_scenes, info.image_sizes), (3, BTreeMap::from([("32x32".into(), 2)])));
         assert_eq!(info.num_frames, Some(MinMedianMax { min: 8.0, median: 8.0, max: 8.0 }));

@@ -29,15 +29,18 @@ fn check_changed(
     change: impl Fn(usize, &mut Camera<IntrinsicsNorm>) + Send + Sync + 'static,
     shown: impl Fn(usize) -> Option<usize> + Send + Sync + 'static,
 ) -> SceneCheck {
-    let source = TestSource::new(testing::rooms(|_| ())).with_cameras(move |_, _| {
-        let mut cameras = room().0.clone();
-        cameras.iter_mut().enumerate().for_each(|(frame, camera)| change(frame, camera));
-        Ok(cameras)
-    });
-    let source = source.with_frames(move |_, _, frame| {
-        let torn = || DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() };
-        shown(frame).map(|shown| room().1[shown].clone()).ok_or_else(torn)
-    });
+    let source = TestSource {
+        base: Box::new(testing::rooms(|_| ())),
+        cameras: Box::new(move |_, _| {
+            let mut cameras = room().0.clone();
+            cameras.iter_mut().enumerate().for_each(|(frame, camera)| change(frame, camera));
+            Ok(cameras)
+        }),
+        frame: Box::new(move |_, _, frame| {
+            let torn = || DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() };
+            shown(frame).map(|shown| room().1[shown].clone()).ok_or_else(torn)
+        }),
+    };
     check_scene(&source, 0)
 }
 
