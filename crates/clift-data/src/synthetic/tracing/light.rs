@@ -12,14 +12,10 @@ const LEAST_MIRROR: f32 = 0.03;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Key {
-    Sun {
-        towards: Vec3,
-    },
+    /// The light is equal everywhere.
+    Sun { towards: Vec3 },
     /// The light halves at `reach`.
-    Lamp {
-        at: Vec3,
-        reach: f32,
-    },
+    Lamp { at: Vec3, reach: f32 },
 }
 
 /// A window or another large light without shadow. The light halves at `reach`.

@@ -123,11 +123,7 @@ impl Solid {
 
     pub fn spans(&self, rays: &Rays) -> Spans {
         let m = &self.to_own;
-        let from = [
-            rays.origin[0] - Vec4::splat(self.center.x),
-            rays.origin[1] - Vec4::splat(self.center.y),
-            rays.origin[2] - Vec4::splat(self.center.z),
-        ];
+        let from = [0, 1, 2].map(|axis| rays.origin[axis] - Vec4::splat(self.center[axis]));
         let own =
             |v: &[Vec4; 3]| [0, 1, 2].map(|row| v[0] * m.x_axis[row] + v[1] * m.y_axis[row] + v[2] * m.z_axis[row]);
         let ([ox, oy, oz], [dx, dy, dz]) = (own(&from), own(&rays.direction));

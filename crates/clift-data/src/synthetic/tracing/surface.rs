@@ -7,26 +7,21 @@ use crate::synthetic::tracing::noise::{byte, edge, floor, hash, octaves, pulse, 
 /// Pattern of a surface; lengths are in periods of the pattern.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Pattern {
+    /// The base colour alone.
     Plain,
+    /// From the base to the second colour and back.
     Gradient,
-    Stripes {
-        duty: f32,
-    },
-    Plaid {
-        duty: f32,
-    },
+    /// Stripes of the second colour, of this share of a period.
+    Stripes { duty: f32 },
+    /// Translucent stripes of the second and third colour, across each other.
+    Plaid { duty: f32 },
+    /// A chessboard.
     Checks,
     /// Cells of one size with joints; `stretch` is width over height, every other row is shifted by `shift`.
-    Bricks {
-        stretch: f32,
-        joint: f32,
-        shift: f32,
-    },
+    Bricks { stretch: f32, joint: f32, shift: f32 },
     /// Clouds of noise; `sharp` above 1 makes spots with edges.
-    Clouds {
-        gain: f32,
-        sharp: f32,
-    },
+    Clouds { gain: f32, sharp: f32 },
+    /// The lines of wood.
     Grain,
     /// Signs of 3 x 5 dots in lines, as writing.
     Glyphs,
@@ -37,15 +32,9 @@ pub(crate) enum Pattern {
     /// Standing strips of different widths in rows, as books.
     Books,
     /// A grid of panes with frames, as a facade.
-    Panes {
-        width: f32,
-        height: f32,
-    },
+    Panes { width: f32, height: f32 },
     /// Sine waves, unfiltered; lengths and the phase are in radians.
-    Waves {
-        wave: Wave,
-        phase: f32,
-    },
+    Waves { wave: Wave, phase: f32 },
 }
 
 /// Share of the second colour as a function of two angles.
