@@ -69,9 +69,7 @@ pub fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> 
 /// Returns the generator whose 32-byte cipher key is the four numbers: distinct numbers give distinct streams.
 fn keyed_rng(seed: u64, purpose: &str, step: u64, item: u64) -> ChaCha8Rng {
     let mut key = [0; 32];
-    for (bytes, value) in key.chunks_exact_mut(8).zip([seed, purpose_tag(purpose), step, item]) {
-        bytes.copy_from_slice(&value.to_le_bytes());
-    }
+    key.copy_from_slice([seed, purpose_tag(purpose), step, item].map(u64::to_le_bytes).as_flattened());
     ChaCha8Rng::from_seed(key)
 }
 

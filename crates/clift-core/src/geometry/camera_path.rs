@@ -33,9 +33,8 @@ fn view_at(context: &[Camera], time: f64) -> Camera {
     let [a, b, c, d] = [before, from, to, after].map(|view| view.c2w.translation);
     let translation = b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)));
     let rotation = DMat3::from_quat(from.c2w.quaternion().slerp(to.c2w.quaternion(), t).normalize());
-    let mix = |a: f64, b: f64| a + t * (b - a);
-    let (a, b) = (from.intrinsics, to.intrinsics);
-    let intrinsics = Intrinsics { fx: mix(a.fx, b.fx), fy: mix(a.fy, b.fy), cx: mix(a.cx, b.cx), cy: mix(a.cy, b.cy) };
+    let [a, b] = [from, to].map(|view| view.intrinsics.to_array());
+    let intrinsics = [0, 1, 2, 3].map(|i| a[i] + t * (b[i] - a[i])).into();
     Camera { c2w: Pose { rotation, translation }, intrinsics }
 }
 
@@ -56,13 +55,8 @@ pub fn orbit_path(context: &[Camera], num_frames: usize) -> Vec<Camera> {
 /// Returns the mean intrinsics of the context views, `None` for no views.
 pub fn mean_intrinsics(context: &[Camera]) -> Option<Intrinsics> {
     let count = context.len() as f64;
-    let mean = |value: fn(&Intrinsics) -> f64| context.iter().map(|view| value(&view.intrinsics) / count).sum();
-    (!context.is_empty()).then(|| Intrinsics {
-        fx: mean(|k| k.fx),
-        fy: mean(|k| k.fy),
-        cx: mean(|k| k.cx),
-        cy: mean(|k| k.cy),
-    })
+    let mean = |i: usize| context.iter().map(|view| view.intrinsics.to_array()[i] / count).sum::<f64>();
+    (!context.is_empty()).then(|| [0, 1, 2, 3].map(mean).into())
 }
 
 /// Returns the distance along the mean view's axis of the point nearest to the axes of all views (least squares).

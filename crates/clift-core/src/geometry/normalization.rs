@@ -56,11 +56,8 @@ impl PoseNormalization {
         scale: PoseScale,
     ) -> Result<Self, CameraError> {
         for (frame, pose) in context.iter().chain(target).enumerate() {
-            pose.check_finite().map_err(|source| CameraError::InFrame {
-                key: key.to_owned(),
-                frame,
-                source: Box::new(source),
-            })?;
+            let in_frame = |source| CameraError::InFrame { key: key.to_owned(), frame, source: Box::new(source) };
+            pose.check_finite().map_err(in_frame)?;
         }
         if context.is_empty() {
             return Err(CameraError::BadCamera {

@@ -289,14 +289,10 @@ fn dl3dv_frames_come_from_the_first_folder_that_is_large_enough() {
         let root = tempfile::tempdir().unwrap();
         let (scene, empty) = (root.path().join("a".repeat(64)), root.path().join("b".repeat(64)));
         fs::create_dir_all(empty.join("images_8")).unwrap();
-        let images: Vec<_> =
-            folders.iter().map(|(folder, width)| (format!("{folder}/0.png"), gray(*width, 9))).collect();
-        let images: Vec<_> = images.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
-        write_capture(
-            &scene,
-            &images,
-            &json!({"fl_x": 300, "w": 384, "h": 256, "frames": [frame_at(0.0, "images/0.png")]}),
-        );
+        let image = |(folder, width): &(&str, usize)| (format!("{folder}/0.png"), gray(*width, 9));
+        let images: Vec<_> = folders.iter().map(image).collect();
+        let transforms = json!({"fl_x": 300, "w": 384, "h": 256, "frames": [frame_at(0.0, "images/0.png")]});
+        write_capture(&scene, &images, &transforms);
         let options = SourceOptions { min_size: [80, 50], ..SourceOptions::default() };
         let OpenedSource { source, report, .. } = crate::open(root.path(), Split::Test, &options).unwrap();
         let width = (source.num_scenes() > 0).then(|| source.image_size(0, 0).unwrap()[0]);

@@ -28,7 +28,7 @@ pub fn gray(width: usize, value: usize) -> Vec<u8> {
 }
 
 /// Writes the image files and the `transforms.json` of a capture.
-pub fn write_capture(root: &Path, images: &[(&str, Vec<u8>)], transforms: &Value) {
+pub fn write_capture(root: &Path, images: &[(impl AsRef<Path>, Vec<u8>)], transforms: &Value) {
     for (name, bytes) in images {
         let path = root.join(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();

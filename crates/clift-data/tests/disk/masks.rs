@@ -2,14 +2,14 @@
 
 use std::fs;
 
-use clift_core::{PoseRotation, PoseScale, RgbImage};
+use clift_core::RgbImage;
 use clift_data::{ClipOptions, ClipReader, OpenedSource, SourceOptions, Split, ViewIndices, encode_png};
 use image::{ImageFormat, RgbaImage};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::files::{copy_of_layout, frame_at, gray, write_capture};
-use crate::{open_test, skipped_frames};
+use crate::{open, open_test, skipped_frames};
 
 const SIZE: [usize; 2] = [24, 16];
 
@@ -63,13 +63,7 @@ fn masked_and_transparent_pixels_have_the_background_and_no_weight() {
 #[test]
 fn clips_have_weights_of_targets_where_a_target_has_a_mask() {
     let (root, opened) = capture(&[("masks/a.png", mask(255))], &json!({}));
-    let options = ClipOptions {
-        half_size: false,
-        width: 16,
-        height: 16,
-        pose_rotation: PoseRotation::Quaternion,
-        pose_scale: PoseScale::Context,
-    };
+    let options = ClipOptions { width: 16, height: 16, ..ClipOptions::default() };
     let reader = ClipReader { source: opened.source, options };
     let read = |context: &[usize], target: &[usize]| {
         reader.read(0, &ViewIndices { context: context.to_vec(), target: target.to_vec() }).unwrap()
@@ -82,8 +76,7 @@ fn clips_have_weights_of_targets_where_a_target_has_a_mask() {
     let half = [vec![255; 64], [[0; 4], [255; 4]].concat().repeat(8)].concat();
     assert_eq!(clip.at_half_resolution().target_weights, Some(half));
     let white = SourceOptions { background: [255; 3], ..SourceOptions::default() };
-    let root = clift_data::DatasetRoot::find(root.path()).unwrap();
-    let opened = clift_data::open_source(&root, Split::Test, &white, &mut |_, _| ()).unwrap();
+    let opened = open(root.path(), Split::Test, &white).unwrap();
     assert_eq!(opened.source.frame(0, 0).unwrap().rgb[0], 255);
 }
 

@@ -223,7 +223,6 @@ fn one_bad_item_costs_one_frame() {
         let root = tempfile::tempdir().unwrap();
         let mut images: Vec<_> = (0..6).map(|frame| (name(frame), jpeg(90))).collect();
         images[3].1 = damage.unwrap_or_else(|| jpeg(90));
-        let images: Vec<_> = images.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
         let mut frames: Vec<Value> = (0..6).map(|frame| frame_at(frame as f64, &name(frame))).collect();
         if let Some((key, value)) = json {
             *(if key.is_empty() { &mut frames[3] } else { &mut frames[3][key] }) = value;
