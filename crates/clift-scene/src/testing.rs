@@ -9,6 +9,18 @@ pub fn devices() -> Vec<Device> {
     names.map(|name| name.open().expect("a CPU device")).collect()
 }
 
+/// Returns a small network of this paper.
+pub fn small_clift() -> ModelConfig {
+    ModelConfig {
+        dim: 16,
+        num_heads: 2,
+        feed_forward_dim: 24,
+        num_encoder_blocks: 1,
+        num_renderer_blocks: 2,
+        ..ModelConfig::default()
+    }
+}
+
 /// Returns a small network of LVSM's paper, whose tokens are learned.
 pub fn small_lvsm() -> ModelConfig {
     ModelConfig {

@@ -144,19 +144,14 @@ fn encode_group(
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{ModelConfig, Network};
+    use clift_model::Network;
 
     use super::*;
+    use crate::testing::small_clift;
 
     #[test]
     fn groups_have_equal_parts_of_a_number_of_tokens_or_a_share_each() {
-        let config = ModelConfig {
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 24,
-            num_encoder_blocks: 1,
-            ..ModelConfig::default()
-        };
+        let config = small_clift();
         let network = Network::new(&config, 3, &Device::flex());
         let model = TrainedModel { network, config, has_condenser: true, device: Device::flex() };
         // Views of 2 x 3 patches.

@@ -1,7 +1,6 @@
 //! The metadata of a scene file's header, and why a file is refused.
 
 use std::collections::HashMap;
-use std::fmt::Write as _;
 
 pub(crate) struct Refusal {
     pub reason: String,
@@ -45,11 +44,7 @@ impl Fields {
 /// Returns a header up to the first tensor. Equal scenes must be equal files, and the safetensors crate writes metadata in
 /// random order.
 pub(crate) fn write_fields(fields: &[(&str, &str)]) -> String {
-    let mut header = String::from("{\"__metadata__\":{");
-    for (i, (name, value)) in fields.iter().enumerate() {
-        let comma = if i == 0 { "" } else { "," };
-        let _ = write!(header, "{comma}\"{name}\":{}", serde_json::Value::from(*value));
-    }
-    header.push('}');
-    header
+    let field = |(name, value): &(&str, &str)| format!("\"{name}\":{}", serde_json::Value::from(*value));
+    let fields: Vec<String> = fields.iter().map(field).collect();
+    format!("{{\"__metadata__\":{{{}}}", fields.join(","))
 }

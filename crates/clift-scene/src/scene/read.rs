@@ -44,12 +44,9 @@ impl Scene {
                 codec_of(&model).map_err(|error| error.to_string())
             })
         };
-        read().map_err(|Refusal { reason, fix }| ModelError::SceneFile {
-            action: "use",
-            reason,
-            fix,
-            path: path.into(),
-        })
+        let unusable =
+            |Refusal { reason, fix }| ModelError::SceneFile { action: "use", reason, fix, path: path.into() };
+        read().map_err(unusable)
     }
 }
 

@@ -141,12 +141,8 @@ impl Scene {
 
     /// Returns the size of the scene's file in bytes.
     pub fn file_bytes(&self, format: TokenFormat) -> u64 {
-        scene_file_bytes(
-            &self.model,
-            self.num_tokens(),
-            (self.context.len(), self.groups.len(), self.num_members()),
-            format,
-        )
+        let counts = (self.context.len(), self.groups.len(), self.num_members());
+        scene_file_bytes(&self.model, self.num_tokens(), counts, format)
     }
 
     /// Returns the `model_path` of a scene file at `file`: relative to the folder of the file for a relative `model`, so that

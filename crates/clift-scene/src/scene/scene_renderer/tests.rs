@@ -4,22 +4,10 @@ use clift_model::{CameraEncoding, Network, SelectionPreset, psnr, save_weights};
 
 use super::*;
 use crate::scene::scene::tests::{camera, scene, scene_of_groups};
-use crate::testing::devices;
-
-fn config() -> ModelConfig {
-    encoded(CameraEncoding::Plucker)
-}
+use crate::testing::{devices, small_clift};
 
 fn encoded(camera_encoding: CameraEncoding) -> ModelConfig {
-    ModelConfig {
-        camera_encoding,
-        dim: 16,
-        num_heads: 2,
-        feed_forward_dim: 24,
-        num_encoder_blocks: 1,
-        num_renderer_blocks: 2,
-        ..ModelConfig::default()
-    }
+    ModelConfig { camera_encoding, ..small_clift() }
 }
 
 /// `scene` with tokens for all of its `count` patches.
@@ -146,29 +134,9 @@ fn middle(frame: &[f32], width: usize, columns: usize) -> Vec<f32> {
 #[test]
 fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
     let device = Device::flex();
-    // The trained image has 24 x 16 pixels; sizes are height and width.
-    let sizes: [[usize; 2]; 20] = [
-        [8, 12],
-        [12, 18],
-        [14, 21],
-        [16, 24],
-        [17, 25],
-        [20, 30],
-        [24, 36],
-        [31, 47],
-        [32, 48],
-        [40, 60],
-        [48, 72],
-        [64, 96],
-        [128, 192],
-        [16, 12],
-        [40, 40],
-        [64, 24],
-        [16, 36],
-        [24, 60],
-        [32, 128],
-        [48, 192],
-    ];
+    // The trained image has 24 x 16 pixels; sizes are height and width, in its proportions and in others.
+    let equal = [8, 12, 14, 16, 17, 20, 24, 32, 40, 48, 64, 128].map(|height: usize| [height, height * 3 / 2]);
+    let others = [[31, 47], [16, 12], [40, 40], [64, 24], [16, 36], [24, 60], [32, 128], [48, 192]];
     for (encoding, grids) in [
         (CameraEncoding::Plucker, PatchGrids::One),
         (CameraEncoding::Gta, PatchGrids::Two),
@@ -183,7 +151,7 @@ fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
             let view = camera(0.1, 0.2).resized([16, 24], size);
             renderer.render(&[view], size[0], size[1], count).unwrap().remove(0).pixels
         };
-        for (size, count) in sizes.into_iter().flat_map(|size| [(size, 12), (size, 5)]) {
+        for (size, count) in equal.into_iter().chain(others).flat_map(|size| [(size, 12), (size, 5)]) {
             let [height, width] = size;
             let trained = frame([16, 24], count);
             // The columns of the frame inside of the trained field of view, in the middle. Those of a wide frame mix with
@@ -215,11 +183,12 @@ fn a_scene_accepts_only_its_own_renderer() {
     let device = Device::flex();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.safetensors");
-    let model = Network::new(&config(), 3, &device);
-    let scene = whole_scene(&model.renderer, &config());
+    let config = small_clift();
+    let model = Network::new(&config, 3, &device);
+    let scene = whole_scene(&model.renderer, &config);
     save_weights(&model, &path).unwrap();
     let renderer = load_renderer(&scene, &path, &device).unwrap();
-    assert_eq!(renderer_hash(&renderer, &config()), scene.renderer_hash);
+    assert_eq!(renderer_hash(&renderer, &config), scene.renderer_hash);
     let assert_refused = |change: fn(&mut ModelConfig), expected: &str| {
         let mut scene = scene.clone();
         change(&mut scene.model);
@@ -231,7 +200,7 @@ fn a_scene_accepts_only_its_own_renderer() {
     assert_refused(|model| model.num_heads = 1, &expected);
     // The same holds for camera-relative attention, which has no weights.
     assert_refused(|model| model.camera_encoding = CameraEncoding::Gta, &expected);
-    save_weights(&Network::new(&config(), 4, &device), &path).unwrap();
+    save_weights(&Network::new(&config, 4, &device), &path).unwrap();
     assert_refused(|_| (), &expected);
     save_weights(&model.encoder, &path).unwrap();
     assert_refused(|model| model.num_renderer_blocks = 1, "parameters of the scene's renderer are missing");
