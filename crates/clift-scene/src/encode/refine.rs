@@ -5,15 +5,15 @@
 // S stored tokens of a group, D width
 
 use burn::module::Module;
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use clift_core::{ClipViews, Pose, ViewDistance, derive_seed, step_rng};
-use clift_model::{Cameras, ModelError, Renderer, Tokens, TrainedModel, Views};
+use clift_model::{ModelError, Renderer, Tokens, TrainedModel, Views};
 use rand::RngExt;
 use rand::distr::weighted::WeightedIndex;
 
 use crate::error::SceneError;
 use crate::scene::scene::{ContextGroup, Scene};
-use crate::scene::scene_renderer::group_shares;
+use crate::scene::scene_renderer::{group_shares, group_tokens};
 
 const PHOTOS_PER_STEP: usize = 3;
 /// Weight of a photo of the group's own views; those of other photos are their shares of the group.
@@ -33,18 +33,14 @@ pub(crate) fn refine(
     let renderer = model.network.renderer.clone().train().no_grad();
     let photos = photos_of_groups(scene);
     progress(0, photos.len());
-    let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
-    let mut first_patch = 0;
     for (i, positions) in scene.tokens_of_groups().iter().enumerate() {
-        let group = &scene.groups[i];
+        let frame = scene.groups[i].frame;
         let seed = derive_seed(seed, &format!("refine group {i}"));
-        let mut fit = GroupFit::new(model, scene, group, positions, first_patch)?;
+        let mut fit = GroupFit::new(scene, i, positions, &model.device)?;
         for step in 0..steps {
-            let chosen = choose(&photos[i], seed, step);
-            let target = ContextGroup { views: chosen, frame: group.frame }.members(context);
+            let target = ContextGroup { views: choose(&photos[i], seed, step), frame }.members(context);
             fit.step(&renderer, &target, model, [step, steps])?;
         }
-        first_patch += (group.views.len() * patches_per_view) as u32;
         let (dim, values) = (scene.model.dim, fit.tokens.to_host()?);
         for (&token, row) in positions.iter().zip(values.chunks_exact(dim)) {
             scene.tokens[token as usize * dim..][..dim].copy_from_slice(row);
@@ -95,22 +91,13 @@ struct GroupFit {
 }
 
 impl GroupFit {
-    fn new(
-        model: &TrainedModel,
-        scene: &Scene,
-        group: &ContextGroup,
-        positions: &[u32],
-        first_patch: u32,
-    ) -> Result<Self, ModelError> {
-        let (dim, device) = (scene.model.dim, &model.device);
-        let rows = positions.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
-        let rows: Vec<f32> = rows.copied().collect();
-        let scale = (rows.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>() / rows.len() as f64).sqrt();
-        let values = Tensor::from_data(TensorData::new(rows, [1, positions.len(), dim]), device);
-        let patches: Vec<u32> = positions.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
-        let cameras = Cameras::of_views(&scene.group_cameras(group), scene.height, scene.width, device)?;
-        let (mean, square) = (Tensor::zeros_like(&values), Tensor::zeros_like(&values));
-        let tokens = Tokens::of_patches(&scene.model, values, &cameras, &patches);
+    fn new(scene: &Scene, group: usize, positions: &[u32], device: &Device) -> Result<Self, ModelError> {
+        let tokens = group_tokens(scene, group, positions, device)?;
+        let (mean, square) = (Tensor::zeros_like(&tokens.values), Tensor::zeros_like(&tokens.values));
+        let dim = scene.model.dim;
+        let values = positions.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
+        let sum: f64 = values.map(|&value| f64::from(value).powi(2)).sum();
+        let scale = (sum / (positions.len() * dim) as f64).sqrt();
         Ok(Self { tokens, mean, square, scale })
     }
 

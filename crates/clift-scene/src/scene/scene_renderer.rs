@@ -96,24 +96,15 @@ struct TokenGroup {
 impl SceneRenderer {
     /// Copies a scene's tokens to a device. `renderer` comes from [`load_renderer`], on the same device.
     pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
-        let (rays, dim) = (scene.token_rays(), scene.model.dim);
-        let patches_per_view = scene.height / scene.model.patch_size * (scene.width / scene.model.patch_size);
+        let rays = scene.token_rays();
         let mut groups = Vec::with_capacity(scene.groups.len());
-        let mut first_patch = 0;
-        for (group, tokens) in scene.groups.iter().zip(scene.tokens_of_groups()) {
-            let rows = tokens.iter().flat_map(|&token| &scene.tokens[token as usize * dim..][..dim]);
-            let values = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, tokens.len(), dim]);
-            let context = scene.group_cameras(group);
-            let cameras = Cameras::of_views(&context, scene.height, scene.width, device)?;
-            let patches: Vec<u32> = tokens.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
-            let values = Tensor::from_data(values, device);
+        for (i, (group, tokens)) in scene.groups.iter().zip(scene.tokens_of_groups()).enumerate() {
             let rays: Vec<TokenRay> = tokens.iter().filter_map(|&token| rays.get(token as usize)).copied().collect();
-            first_patch += (group.views.len() * patches_per_view) as u32;
             groups.push(TokenGroup {
                 views: group.views.iter().map(|&view| scene.context[view as usize].c2w).collect(),
                 context: group.clone(),
-                trained: TrainedImage::new(scene, &context),
-                cache: renderer.project_tokens(Tokens::of_patches(&scene.model, values, &cameras, &patches)),
+                trained: TrainedImage::new(scene, &scene.group_cameras(group)),
+                cache: renderer.project_tokens(group_tokens(scene, i, &tokens, device)?),
                 selector: Selector::new(rules, &rays)?,
                 tokens,
             });
@@ -257,6 +248,21 @@ impl SceneRenderer {
         };
         Ok(plans.iter().map(frame).collect())
     }
+}
+
+/// Copies the tokens of group `i`, which are at these positions, to a device, with the transforms of their patches.
+///
+/// # Shapes
+/// - returns `[1, positions, D]`
+pub(crate) fn group_tokens(scene: &Scene, i: usize, positions: &[u32], device: &Device) -> Result<Tokens, ModelError> {
+    let Scene { ref model, height, width, .. } = *scene;
+    let rows = positions.iter().flat_map(|&token| &scene.tokens[token as usize * model.dim..][..model.dim]);
+    let rows = TensorData::new(rows.copied().collect::<Vec<f32>>(), [1, positions.len(), model.dim]);
+    let members_before: usize = scene.groups[..i].iter().map(|group| group.views.len()).sum();
+    let first_patch = (members_before * (height / model.patch_size) * (width / model.patch_size)) as u32;
+    let patches: Vec<u32> = positions.iter().map(|&token| scene.token_ids[token as usize] - first_patch).collect();
+    let cameras = Cameras::of_views(&scene.group_cameras(&scene.groups[i]), height, width, device)?;
+    Ok(Tokens::of_patches(model, Tensor::from_data(rows, device), &cameras, &patches))
 }
 
 /// Returns the nearest groups and their shares of a frame, which add up to 1 and change continuously with the distances: a
