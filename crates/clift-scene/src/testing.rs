@@ -9,7 +9,7 @@ pub fn devices() -> Vec<Device> {
     names.map(|name| name.open().expect("a CPU device")).collect()
 }
 
-/// Returns a small network of this paper.
+/// Returns a small network with patch tokens.
 pub fn small_clift() -> ModelConfig {
     ModelConfig {
         dim: 16,

@@ -153,15 +153,8 @@ mod tests {
             5 => panic!("boom at {step}"),
             _ => Ok(step),
         };
-        let expected = vec![
-            Ok(0),
-            Ok(1),
-            Ok(2),
-            Err(Failure::Bad(3)),
-            Ok(4),
-            Err(Failure::Panicked(WorkerPanic { step: 5, message: "boom at 5".into() })),
-            Ok(6),
-        ];
+        let panicked = Failure::Panicked(WorkerPanic { step: 5, message: "boom at 5".into() });
+        let expected = [Ok(0), Ok(1), Ok(2), Err(Failure::Bad(3)), Ok(4), Err(panicked), Ok(6)];
         for threads in [0, 1, 3] {
             let items = within_seconds(move || Prefetcher::new(make, 0, 7, threads, 2).collect::<Vec<_>>());
             assert_eq!(items, expected, "{threads} threads");

@@ -133,7 +133,6 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     let kind = field("kind")?;
     let kind = parse_variant(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
     let file = Tensors(file);
-    let f64s = |name: &str, shape: &[usize]| file.f64s(name, shape);
     let f32s = |name: &str, shape: &[usize]| {
         let values = file.f32s(name, shape)?;
         match values.iter().find(|value| !value.is_finite()) {
@@ -141,8 +140,8 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
             None => Ok(values),
         }
     };
-    let length = |name: &str| file.length(name);
-    let (dim, knots, counts, steps) = (model.dim, length("knots")?, length("rate_shares")?, length("rate_steps")?);
+    let (dim, knots) = (model.dim, file.length("knots")?);
+    let (counts, steps) = (file.length("rate_shares")?, file.length("rate_steps")?);
     let transform = Transform {
         mean: f32s("mean", &[dim])?,
         basis: f32s("basis", &[dim, dim])?,
@@ -158,9 +157,9 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
     check_transform(&transform)?;
     check_distributions(&distributions)?;
     let rates = RateTable {
-        shares: f64s("rate_shares", &[counts])?,
-        steps: f64s("rate_steps", &[steps])?,
-        loss: f64s("rate_loss", &[counts, steps])?,
+        shares: file.f64s("rate_shares", &[counts])?,
+        steps: file.f64s("rate_steps", &[steps])?,
+        loss: file.f64s("rate_loss", &[counts, steps])?,
     };
     let rates = rates.checked().map_err(|error| error.to_string())?;
     let renderer_hash = field("renderer")?.clone();

@@ -119,7 +119,7 @@ impl Triplet {
         let [first, second] = self.others.map(|frame| &cameras[frame]);
         let judged = &cameras[self.frame];
         let distance = |[a, b, seen]: &[[f64; 2]; 3]| {
-            let [x, y] = transferred(first, *a, second, *b, judged)?;
+            let [x, y] = transferred([first, second, judged], *a, *b)?;
             Some((x - seen[0]).hypot(y - seen[1]))
         };
         // A point that cannot be projected is as far away as it can be.
@@ -168,13 +168,7 @@ pub(crate) fn find_triplets(num_frames: usize, pairs: &[FramePair]) -> Vec<Vec<T
 
 /// Places a point by its corners `a` and `b` in two frames, and projects it into a third. A point at infinity is
 /// projected too. Returns `None` for a point in the plane of the third camera.
-fn transferred(
-    first: &PixelCamera,
-    a: [f64; 2],
-    second: &PixelCamera,
-    b: [f64; 2],
-    third: &PixelCamera,
-) -> Option<[f64; 2]> {
+fn transferred([first, second, third]: [&PixelCamera; 3], a: [f64; 2], b: [f64; 2]) -> Option<[f64; 2]> {
     let ray = first.ray(a);
     // Homogeneous pixels of the point with inverse depth `s` on the ray are `direction + s * origin`.
     let along = |camera: &PixelCamera| [camera.project_direction(ray), camera.project(first.c2w.translation)];

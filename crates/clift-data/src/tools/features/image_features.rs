@@ -23,7 +23,13 @@ pub struct Features {
 
 impl Features {
     pub fn detect(image: &RgbImage) -> Self {
-        let large = reduced(image);
+        // At most `WIDTH` columns.
+        let large = if image.width > WIDTH {
+            let height = (image.height as f64 * WIDTH as f64 / image.width as f64).round().max(1.0) as usize;
+            resize_lanczos(image, WIDTH, height)
+        } else {
+            image.clone()
+        };
         let unit = WIDTH as f64 / large.width as f64;
         let smaller = |side: usize| ((side as f64 * SMALLER).round() as usize).max(1);
         let small = resize_lanczos(&large, smaller(large.width), smaller(large.height));
@@ -50,13 +56,4 @@ impl Features {
             pairs.into_iter().map(|(a, b)| Correspondence { first: self.points[a], second: other.points[b] }).collect();
         ransac_inliers(&matches)
     }
-}
-
-/// Reduces an image to at most [`WIDTH`] columns.
-pub fn reduced(image: &RgbImage) -> RgbImage {
-    if image.width <= WIDTH {
-        return image.clone();
-    }
-    let height = (image.height as f64 * WIDTH as f64 / image.width as f64).round().max(1.0) as usize;
-    resize_lanczos(image, WIDTH, height)
 }

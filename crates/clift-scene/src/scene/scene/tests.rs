@@ -58,8 +58,8 @@ impl Folder {
         self.0.path().join("room.clift")
     }
 
-    fn bytes(&self, format: TokenFormat) -> Vec<u8> {
-        scene().write(&self.path(), format).expect("writes");
+    fn bytes(&self, scene: &Scene, format: TokenFormat) -> Vec<u8> {
+        scene.write(&self.path(), format).expect("writes");
         std::fs::read(self.path()).expect("reads")
     }
 
@@ -84,14 +84,12 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
     let folder = Folder::new();
     for (scene, place) in [(scene(), 28), (latents(), 0)] {
         for format in TokenFormat::ALL {
-            scene.write(&folder.path(), format).expect("writes");
-            let bytes = std::fs::read(folder.path()).expect("reads");
+            let bytes = folder.bytes(&scene, format);
             let expected = 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + 5 * (place + format.bytes_per_token(DIM));
             assert_eq!((bytes.len(), scene.file_bytes(format)), (expected, expected as u64), "{format}");
             let tokens = format.round(&scene.tokens).expect("in range");
             assert_eq!(Scene::read(&folder.path()).expect("reads"), (Scene { tokens, ..scene.clone() }, format.into()));
-            scene.write(&folder.path(), format).expect("writes");
-            assert_eq!(std::fs::read(folder.path()).expect("reads"), bytes, "equal scenes are equal files");
+            assert_eq!(folder.bytes(&scene, format), bytes, "equal scenes are equal files");
         }
     }
     assert_eq!(std::fs::read_dir(folder.0.path()).expect("a folder").count(), 1, "no temporary file is left");
@@ -118,9 +116,7 @@ pub(crate) fn scene_of_groups() -> Scene {
 fn groups_survive_a_file_and_own_the_tokens_of_their_views() {
     let folder = Folder::new();
     let scene = scene_of_groups();
-    scene.write(&folder.path(), TokenFormat::F32).expect("writes");
-    let bytes = std::fs::metadata(folder.path()).expect("a file").len();
-    assert_eq!(bytes, scene.file_bytes(TokenFormat::F32));
+    assert_eq!(folder.bytes(&scene, TokenFormat::F32).len() as u64, scene.file_bytes(TokenFormat::F32));
     assert_eq!(Scene::read(&folder.path()).expect("reads").0, scene);
     assert_eq!(scene.tokens_of_groups(), [vec![0, 1, 2], vec![3, 4, 5]]);
     // Token 3 is patch 12: the first of the first view of the second group, in the frame of that group.
@@ -140,9 +136,7 @@ fn latents() -> Scene {
 #[test]
 fn other_latents_than_those_of_the_network_are_refused() {
     let (folder, latents) = (Folder::new(), latents());
-    latents.write(&folder.path(), TokenFormat::F16).expect("writes");
-    let bytes = std::fs::read(folder.path()).expect("reads");
-    let fewer = with_header(&bytes, &[(r#"num_latents\":5"#, r#"num_latents\":4"#)]);
+    let fewer = with_header(&folder.bytes(&latents, TokenFormat::F16), &[(r#"num_latents\":5"#, r#"num_latents\":4"#)]);
     folder.assert_refused(&fewer, "`tokens` is F16 [5, 8], expected F16 [4, 8]");
     let few = Scene { token_ids: vec![0, 1, 2, 4, 3], ..latents.clone() };
     folder.assert_not_written(&few, TokenFormat::F32, "expected all 5 learned tokens in order");
@@ -155,7 +149,7 @@ fn damaged_files_are_refused_with_a_remedy() {
     let folder = Folder::new();
     folder.assert_refused(&[9, 0, 0], "the file is truncated: 3 bytes; copy it again");
     folder.assert_refused(b"\x89PNG\r\n\x1a\n and so on", "give a file that `clift encode` wrote");
-    let bytes = folder.bytes(TokenFormat::F16);
+    let bytes = folder.bytes(&scene(), TokenFormat::F16);
     let length = 8 + HEADER_BYTES - 1;
     folder.assert_refused(&bytes[..length], "truncated: 2055 bytes with a header of 2048 bytes; copy");
     let cut = "the file is truncated or has bytes after its last tensor; copy it again";
@@ -175,7 +169,7 @@ fn damaged_files_are_refused_with_a_remedy() {
 #[test]
 fn invalid_headers_are_refused() {
     let folder = Folder::new();
-    let bytes = folder.bytes(TokenFormat::F32);
+    let bytes = folder.bytes(&scene(), TokenFormat::F32);
     let refused =
         |changes: &[(&str, &str)], expected: &str| folder.assert_refused(&with_header(&bytes, changes), expected);
     for field in ["kind", "model", "renderer", "key", "height", "model_path"] {
@@ -236,7 +230,7 @@ fn invalid_tensor_values_are_refused() {
     ];
     let folder = Folder::new();
     for &(format, name, at, data, expected) in cases {
-        let mut bytes = folder.bytes(format);
+        let mut bytes = folder.bytes(&scene(), format);
         let file = SafeTensors::deserialize(&bytes).expect("valid");
         let start = file.tensor(name).expect("there").data().as_ptr() as usize - bytes.as_ptr() as usize;
         bytes[start + at..][..data.len()].copy_from_slice(data);
@@ -247,7 +241,7 @@ fn invalid_tensor_values_are_refused() {
 #[test]
 fn a_failed_write_leaves_the_old_file() {
     let folder = Folder::new();
-    let before = folder.bytes(TokenFormat::F32);
+    let before = folder.bytes(&scene(), TokenFormat::F32);
     let mut broken = scene();
     broken.tokens[3] = f32::NAN;
     for (scene, format, expected) in [
@@ -261,7 +255,7 @@ fn a_failed_write_leaves_the_old_file() {
     assert_eq!(std::fs::read_dir(folder.0.path()).expect("a folder").count(), 1);
     // Files that are not scenes, and links, stay; a truncated scene is replaced.
     std::fs::write(folder.path(), &before[..1000]).unwrap();
-    folder.bytes(TokenFormat::F16);
+    folder.bytes(&scene(), TokenFormat::F16);
     std::fs::write(folder.path(), b"weights").unwrap();
     folder.assert_not_written(&scene(), TokenFormat::F16, "the existing file is not a scene, and only scenes are");
     std::fs::rename(folder.path(), folder.0.path().join("weights")).unwrap();
