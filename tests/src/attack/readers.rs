@@ -11,7 +11,7 @@ use clift_data::{
     encode_png, open_source,
 };
 use clift_model::{CliftVariant, Network, load_part};
-use clift_train::{CheckpointConfig, Checkpoints, ClusterCache, Config, OptimizerConfig, Run, TrainState, import};
+use clift_train::{Checkpoints, ClusterCache, Config, OptimizerConfig, Run, TrainState, import};
 
 use crate::setup::{Setup, copy_folder, fixture, fixtures, read, with_pickle, write};
 
@@ -110,8 +110,7 @@ pub fn checkpoint(setup: &Setup, name: &'static str) -> (Vec<Vec<u8>>, Read) {
             write(&step.join("state.json"), state.to_string().as_bytes());
         }
         let mut train_state = TrainState::new(model.clone(), &OptimizerConfig::default(), Device::flex().autodiff());
-        let retention = CheckpointConfig::default();
-        done(Checkpoints { folder: folder.clone(), retention, model: None }.load(6, &mut train_state))
+        done(Checkpoints { folder: folder.clone(), model: None }.load(6, &mut train_state))
     });
     (vec![valid], read)
 }

@@ -29,8 +29,6 @@ fn killed_runs_end_the_same_with_any_loader_threads() {
         assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
         place.eval(name).ok();
         assert_eq!(place.checkpoints(name, "stage1"), [17, 30]);
-        // The best validation decides which checkpoints are kept.
-        assert!(place.progress(name, "stage2")["best"]["step"].is_u64());
         place.assert_same_run(name, "whole");
     }
 }

@@ -10,8 +10,7 @@ use burn::store::ModuleRecord;
 use clift_core::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, Network, first_not_f32};
 
-use crate::checkpoint::progress::{Best, Fingerprint, STATE, State, TrainingPosition, VERSION};
-use crate::config::config::CheckpointConfig;
+use crate::checkpoint::progress::{Fingerprint, STATE, State, TrainingPosition, VERSION};
 use crate::error::TrainError;
 use crate::step::train_state::TrainState;
 
@@ -25,18 +24,21 @@ const LOADING: &str = "loading a checkpoint";
 pub struct Checkpoints {
     /// Folder of the checkpoints.
     pub folder: PathBuf,
-    /// Which checkpoints are kept.
-    pub retention: CheckpointConfig,
     /// Config of the network: stored in every checkpoint, and checkpoints of another network are refused.
     pub model: Option<ModelConfig>,
 }
 
 impl Checkpoints {
-    /// Saves model, optimizer and progress, and removes the checkpoints that are no longer kept.
+    /// Saves model, optimizer and progress, and removes all checkpoints but the newest `keep`.
     ///
     /// # Errors
     /// [`TrainError::Io`]; older checkpoints are then unchanged, and files of this one are removed.
-    pub fn save(&self, train_state: &TrainState, progress: &TrainingPosition) -> Result<PathBuf, TrainError> {
+    pub fn save(
+        &self,
+        train_state: &TrainState,
+        progress: &TrainingPosition,
+        keep: usize,
+    ) -> Result<PathBuf, TrainError> {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
         remove_if_present(&temporary)?;
@@ -46,7 +48,7 @@ impl Checkpoints {
             drop(std::fs::remove_dir_all(&temporary));
         }
         written?;
-        self.prune(progress)?;
+        self.prune(keep)?;
         Ok(path)
     }
 
@@ -78,12 +80,10 @@ impl Checkpoints {
         publish_folder(temporary, path).map_err(TrainError::io(SAVING, path))
     }
 
-    /// Writes the progress after a validation to the checkpoint of its step, and removes the checkpoints that are no longer
-    /// kept.
+    /// Writes the progress after a validation to the checkpoint of its step.
     pub fn update(&self, progress: &TrainingPosition) -> Result<(), TrainError> {
         let path = self.path_of(progress.step);
-        State { progress: progress.clone(), ..State::read(&path)? }.write(&path)?;
-        self.prune(progress)
+        State { progress: progress.clone(), ..State::read(&path)? }.write(&path)
     }
 
     /// Loads the checkpoint of a step into `train_state`, and changes no file.
@@ -194,21 +194,16 @@ impl Checkpoints {
         self.items()?.into_iter().filter(is_unfinished).try_for_each(|path| remove_if_present(&path))
     }
 
-    fn prune(&self, progress: &TrainingPosition) -> Result<(), TrainError> {
+    /// Removes unfinished saves, and all checkpoints but the newest `keep`.
+    fn prune(&self, keep: usize) -> Result<(), TrainError> {
         self.remove_unfinished()?;
-        for step in steps_to_remove(&self.steps()?, &self.retention, progress.best) {
-            let path = self.path_of(step);
+        let steps = self.steps()?;
+        for step in &steps[..steps.len().saturating_sub(keep)] {
+            let path = self.path_of(*step);
             remove_folder(&path).map_err(TrainError::io("removing an old checkpoint", &path))?;
         }
         Ok(())
     }
-}
-
-/// Returns the steps, oldest first, that are neither among the last nor the best.
-fn steps_to_remove(steps: &[u64], retention: &CheckpointConfig, best: Option<Best>) -> Vec<u64> {
-    let CheckpointConfig { keep, keep_best, .. } = *retention;
-    let is_best = |step: u64| keep_best && best.is_some_and(|best| best.step == step);
-    steps[..steps.len().saturating_sub(keep)].iter().copied().filter(|step| !is_best(*step)).collect()
 }
 
 fn name_of(step: u64) -> String {
@@ -269,9 +264,9 @@ mod tests {
         let device = burn::tensor::Device::flex().autodiff();
         let model = clift_model::Network::new(&config, 0, &device);
         let train_state = TrainState::new(model, &crate::config::config::OptimizerConfig::default(), device);
-        let checkpoints = Checkpoints { folder: root.into(), retention: CheckpointConfig::default(), model: None };
+        let checkpoints = Checkpoints { folder: root.into(), model: None };
         let step =
-            checkpoints.save(&train_state, &TrainingPosition { step: 1, ..TrainingPosition::default() }).unwrap();
+            checkpoints.save(&train_state, &TrainingPosition { step: 1, ..TrainingPosition::default() }, 1).unwrap();
         (train_state, checkpoints, step)
     }
 
@@ -326,14 +321,15 @@ mod tests {
     }
 
     #[test]
-    fn last_and_best_checkpoints_are_kept() {
-        let removed = |keep, keep_best, best: u64| {
-            let retention = CheckpointConfig { every: 10, keep, keep_best };
-            steps_to_remove(&[10, 20, 30, 40], &retention, Some(Best { step: best, psnr: 20.0 }))
-        };
-        assert_eq!(removed(2, false, 20), [10, 20]);
-        assert_eq!(removed(2, true, 20), [10]);
-        assert_eq!(removed(1, true, 40), [10, 20, 30], "the best is the last");
-        assert_eq!(removed(9, false, 20), [0; 0]);
+    fn newest_checkpoints_are_kept() {
+        let place = tempfile::tempdir().unwrap();
+        let checkpoints = Checkpoints { folder: place.path().into(), model: None };
+        for step in [10, 20, 30, 40] {
+            std::fs::create_dir(checkpoints.path_of(step)).unwrap();
+        }
+        for (keep, kept) in [(9, &[10, 20, 30, 40][..]), (2, &[30, 40]), (1, &[40])] {
+            checkpoints.prune(keep).unwrap();
+            assert_eq!(checkpoints.steps().unwrap(), kept);
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! Saved state of a stage.
 //!
 //! - `progress`: state.json of a checkpoint
-//! - `checkpoints`: save, resume, keep the best
+//! - `checkpoints`: save, resume, keep the newest
 //! - `newest`: the model of a run that is still training
 
 pub(crate) mod checkpoints;

@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use clift_model::{Network, TrainedModel};
 
 use crate::checkpoint::checkpoints::Checkpoints;
-use crate::config::config::{CheckpointConfig, Config};
+use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
 
@@ -51,5 +51,5 @@ impl NewestCheckpoint {
 
 fn checkpoints(run: &Path, stage: Stage) -> Checkpoints {
     let folder = run.join(stage.name()).join("checkpoints");
-    Checkpoints { folder, retention: CheckpointConfig::default(), model: None }
+    Checkpoints { folder, model: None }
 }

@@ -311,13 +311,11 @@ pub struct CheckpointConfig {
     pub every: u64,
     /// Number of latest checkpoints to keep.
     pub keep: usize,
-    /// Whether the checkpoint with the best validation (`eval.every`) is also kept.
-    pub keep_best: bool,
 }
 
 impl Default for CheckpointConfig {
     fn default() -> Self {
-        Self { every: 1000, keep: 2, keep_best: true }
+        Self { every: 1000, keep: 2 }
     }
 }
 

@@ -15,7 +15,7 @@ use clift_eval::peak_bytes;
 use clift_model::{Network, psnr_of_mse, weights_hash};
 
 use crate::checkpoint::checkpoints::Checkpoints;
-use crate::checkpoint::progress::{Best, TrainingPosition};
+use crate::checkpoint::progress::TrainingPosition;
 use crate::config::config::Config;
 use crate::distributed::parts::BatchParts;
 use crate::distributed::ranks::Ranks;
@@ -78,11 +78,7 @@ pub(crate) fn train_stage(
     let started = Instant::now();
     let StagePlan { settings, config, folder, device, ranks, .. } = plan;
     let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
-    let checkpoints = Checkpoints {
-        folder: folder.join("checkpoints"),
-        retention: config.checkpoint.clone(),
-        model: Some(config.model.clone()),
-    };
+    let checkpoints = Checkpoints { folder: folder.join("checkpoints"), model: Some(config.model.clone()) };
     let newest = ranks.from_root(|| {
         require_run(&config.run_dir)?;
         checkpoints.newest_step()
@@ -286,7 +282,7 @@ impl TrainLoop<'_> {
         require_run(&self.plan.config.run_dir)?;
         // A resumed run does not write the lines of these steps again.
         self.log.check()?;
-        let path = self.checkpoints.save(train_state, &self.progress)?;
+        let path = self.checkpoints.save(train_state, &self.progress, self.plan.config.checkpoint.keep)?;
         self.log.event(&Event::Checkpoint { path });
         Ok(())
     }
@@ -311,29 +307,25 @@ impl TrainLoop<'_> {
             return Ok(());
         }
         let ranks = self.plan.ranks;
-        let psnr = ranks.from_root(|| {
+        let has_result = ranks.from_root(|| {
             require_run(&self.plan.config.run_dir)?;
             let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
             let model = train_state.model.valid();
             self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)
         })?;
-        if psnr.is_none() && ranks.any(self.stop.load(Ordering::Relaxed))? {
+        if has_result {
+            self.progress.validated = step;
+            let is_updated = ranks.is_root() && self.is_checkpoint_due();
+            return if is_updated { self.checkpoints.update(&self.progress) } else { Ok(()) };
+        }
+        // A resumed run validates again.
+        if ranks.any(self.stop.load(Ordering::Relaxed))? {
             if self.saved < step {
                 self.save(train_state)?;
             }
             return Err(TrainError::Interrupted { step });
         }
-        // Without a result, a resumed run validates again.
-        let Some(psnr) = psnr else { return Ok(()) };
-        self.progress.validated = step;
-        if !self.is_checkpoint_due() {
-            return Ok(());
-        }
-        // Only regular checkpoints count, not those saved on an interrupt: the best is the same after any interruption.
-        if self.progress.best.is_none_or(|best| psnr > best.psnr) {
-            self.progress.best = Some(Best { step, psnr });
-        }
-        if ranks.is_root() { self.checkpoints.update(&self.progress) } else { Ok(()) }
+        Ok(())
     }
 
     fn is_checkpoint_due(&self) -> bool {

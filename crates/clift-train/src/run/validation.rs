@@ -66,8 +66,8 @@ impl<'a> Validation<'a> {
     }
 
     /// Measures a model without autodiff during training: with all tokens in stage 1, with one count of condensed tokens in
-    /// stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB; `None` if no view could be measured
-    /// or `stop` is set.
+    /// stage 2. Writes the first contact sheet to `folder`. Returns whether there is a result: no view may be measurable, or
+    /// `stop` set.
     pub fn validate(
         &self,
         model: &Network,
@@ -76,7 +76,7 @@ impl<'a> Validation<'a> {
         folder: &Path,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
-    ) -> Result<Option<f64>, TrainError> {
+    ) -> Result<bool, TrainError> {
         let Config { eval: settings, clusters, model: sizes, .. } = self.config;
         let is_stage2 = stage == Stage::Stage2;
         let model = TrainedModel::snapshot(model, sizes, is_stage2);
@@ -106,14 +106,14 @@ impl<'a> Validation<'a> {
         let limits = SceneLimits { num_scenes: settings.num_validation_scenes, num_sheets: 1 };
         let mut progress = EvalEvents { stop, sink, is_stage: false };
         let measured = match self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, &mut progress) {
-            Err(EvalError::Interrupted { .. }) => return Ok(None),
+            Err(EvalError::Interrupted { .. }) => return Ok(false),
             measured => measured?.0,
         };
         let summary = Summary::new(&measured);
-        let Some(point) = summary.points.first() else { return Ok(None) };
+        let Some(point) = summary.points.first() else { return Ok(false) };
         let (psnr, ssim) = (point.quality.psnr.unwrap_or(f64::NAN), point.quality.ssim);
         sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
-        Ok(point.quality.psnr.filter(|psnr| psnr.is_finite()))
+        Ok(psnr.is_finite())
     }
 
     /// Evaluates models on the views of this validation.
