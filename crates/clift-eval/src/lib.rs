@@ -28,9 +28,8 @@ pub use config::split::{EvalFrames, EvalSplit};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.
-pub use evaluator::evaluator::{Evaluator, SceneLimits, write_skip_report};
+pub use evaluator::evaluator::{EvalEvent, Evaluator, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
-pub use evaluator::progress::EvalProgress;
 pub use evaluator::sheets::file_name;
 pub use report::page::RunDescription;
 

@@ -1,9 +1,8 @@
 //! Events of a run, which sinks print or write to files.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_eval::EvalProgress;
+use clift_eval::EvalEvent;
 use serde::{Deserialize, Serialize};
 
 /// A training stage.
@@ -118,33 +117,16 @@ impl<F: FnMut(&Event)> Sink for F {
     }
 }
 
-/// Reports the progress of an evaluation as events of a run.
-pub(crate) struct EvalEvents<'a> {
-    pub stop: &'a AtomicBool,
-    pub sink: &'a mut dyn Sink,
-    /// Whether scenes are counted: in an evaluation, not in a validation.
-    pub is_stage: bool,
-}
-
-impl EvalProgress for EvalEvents<'_> {
-    fn done(&mut self, scenes: usize, total: usize) {
-        let (run_step, done, total) = (RunStep::Eval, scenes as u64, total as u64);
-        match (self.is_stage, done) {
-            (false, _) => {}
-            (true, 0) => self.sink.event(&Event::StepStarted { run_step, done, num_steps: total }),
-            (true, _) => self.sink.event(&Event::Progress { run_step, done, total }),
-        }
-    }
-
-    fn note(&mut self, text: &str) {
-        self.sink.event(&Event::Message(text.into()));
-    }
-
-    fn skipped(&mut self, key: &str, reason: &str) {
-        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
-    }
-
-    fn is_interrupted(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
+/// Returns the events of an evaluation as those of a run. Scenes are counted if `is_stage`: not in a validation.
+pub(crate) fn eval_events(sink: &mut dyn Sink, is_stage: bool) -> impl FnMut(EvalEvent<'_>) {
+    let run_step = RunStep::Eval;
+    move |event: EvalEvent| {
+        sink.event(&match event {
+            EvalEvent::Done(..) if !is_stage => return,
+            EvalEvent::Done(0, total) => Event::StepStarted { run_step, done: 0, num_steps: total as u64 },
+            EvalEvent::Done(done, total) => Event::Progress { run_step, done: done as u64, total: total as u64 },
+            EvalEvent::Note(text) => Event::Message(text.into()),
+            EvalEvent::Skipped(key, reason) => Event::Skipped { key: key.into(), reason: reason.into() },
+        });
     }
 }

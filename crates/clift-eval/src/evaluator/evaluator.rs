@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
 use clift_core::replace_file;
@@ -14,7 +15,6 @@ use crate::config::method::Method;
 use crate::config::split::{EvalFrames, EvalSplit};
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
-use crate::evaluator::progress::EvalProgress;
 use crate::evaluator::sheets::Sheets;
 use crate::figures::canvas::Canvas;
 use crate::figures::contact_sheet::contact_sheet;
@@ -86,7 +86,8 @@ impl Evaluator {
         &self,
         models: &EvalModels,
         folder: &Path,
-        progress: &mut dyn EvalProgress,
+        stop: &AtomicBool,
+        progress: &mut dyn FnMut(EvalEvent),
     ) -> Result<Summary, EvalError> {
         let lpips = self.lpips(progress)?;
         let (methods, formats) = (self.methods(models)?, self.formats(models, progress)?);
@@ -95,7 +96,7 @@ impl Evaluator {
             lpips: lpips.clone().ok(),
             ..self.sweep.clone()
         };
-        progress.done(0, self.items.len());
+        progress(EvalEvent::Done(0, self.items.len()));
         let sheets = Sheets::new(folder)?;
         let mut shown = Vec::new();
         let mut keep_sheet = |key: &str, sheet: Canvas| {
@@ -106,7 +107,7 @@ impl Evaluator {
             Ok(())
         };
         let limits = SceneLimits { num_scenes: self.items.len(), num_sheets: self.sweep.eval.num_sheets };
-        let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_sheet, progress)?;
+        let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_sheet, stop, progress)?;
         match &lpips {
             Ok(lpips) => measured.facts.lpips_weights_sha256 = Some(lpips.sha256().into()),
             Err(reason) => measured.note_not_measured("lpips_vgg", reason.clone()),
@@ -136,14 +137,15 @@ impl Evaluator {
     /// the metrics, and the scenes whose views could not be chosen or read.
     ///
     /// # Errors
-    /// [`EvalError::Interrupted`] when `progress` requests a stop; as `evaluate_scene` and `keep_sheet`.
+    /// [`EvalError::Interrupted`] when `stop` is set; as `evaluate_scene` and `keep_sheet`.
     pub fn measure(
         &self,
         models: &EvalModels,
         sweep: &Sweep,
         limits: SceneLimits,
         keep_sheet: &mut dyn FnMut(&str, Canvas) -> Result<(), EvalError>,
-        progress: &mut dyn EvalProgress,
+        stop: &AtomicBool,
+        progress: &mut dyn FnMut(EvalEvent),
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.sweep.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
@@ -152,7 +154,7 @@ impl Evaluator {
         measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
         for (i, item) in self.items.iter().take(total).enumerate() {
-            if progress.is_interrupted() {
+            if stop.load(Ordering::Relaxed) {
                 return Err(EvalError::Interrupted { done: i, total });
             }
             let key = self.reader.source.key(item.scene);
@@ -165,18 +167,18 @@ impl Evaluator {
                 }
                 Err(error) => {
                     let reason = error.to_string();
-                    progress.skipped(key, &reason);
+                    progress(EvalEvent::Skipped(key, &reason));
                     measured.skipped.insert(key.into());
                     skip_report.skip(key, reason);
                 }
             }
-            progress.done(i + 1, total);
+            progress(EvalEvent::Done(i + 1, total));
         }
         Ok((measured, skip_report))
     }
 
     /// Returns the formats of the stored tokens, without coded ones if the model has no codec.
-    fn formats(&self, models: &EvalModels, progress: &mut dyn EvalProgress) -> Result<Vec<TokenCoding>, EvalError> {
+    fn formats(&self, models: &EvalModels, progress: &mut dyn FnMut(EvalEvent)) -> Result<Vec<TokenCoding>, EvalError> {
         let mut formats = self.sweep.eval.formats.clone();
         let mut seen = BTreeSet::new();
         formats.retain(|format| seen.insert(*format));
@@ -188,13 +190,13 @@ impl Evaluator {
                 let (value, fix) = (coded.to_string(), fix.into());
                 return Err(ModelError::BadConfig { key: "eval.formats", value, fix }.into());
             }
-            progress.note(&format!("{coded} tokens are left out: {fix}"));
+            progress(EvalEvent::Note(&format!("{coded} tokens are left out: {fix}")));
         }
         Ok(formats)
     }
 
     /// Loads LPIPS, or returns the reason why LPIPS is not measured.
-    fn lpips(&self, progress: &mut dyn EvalProgress) -> Result<Result<Lpips, String>, EvalError> {
+    fn lpips(&self, progress: &mut dyn FnMut(EvalEvent)) -> Result<Result<Lpips, String>, EvalError> {
         let size = self.reader.options.width.min(self.reader.options.height);
         Ok(match self.sweep.eval.lpips_path() {
             _ if size < LPIPS_MIN_SIZE_PX => {
@@ -202,7 +204,7 @@ impl Evaluator {
             }
             Some(path) => {
                 let lpips = Lpips::load(path, &self.device)?;
-                progress.note(&format!("LPIPS: weights with SHA-256 {}", lpips.sha256()));
+                progress(EvalEvent::Note(&format!("LPIPS: weights with SHA-256 {}", lpips.sha256())));
                 Ok(lpips)
             }
             None => Err(format!("eval.lpips_weights is not set; make the file with `{LPIPS_COMMAND}`")),
@@ -240,6 +242,17 @@ impl Evaluator {
         let value = method.name().into();
         Err(ModelError::BadConfig { key: "eval.methods", value, fix }.into())
     }
+}
+
+/// Progress of an evaluation.
+#[derive(Clone, Copy, Debug)]
+pub enum EvalEvent<'a> {
+    /// Number of scenes that are done, of all. The first event has 0.
+    Done(usize, usize),
+    /// A line of text.
+    Note(&'a str),
+    /// Key of a skipped scene, and the reason.
+    Skipped(&'a str, &'a str),
 }
 
 /// Numbers of measured scenes and of scenes with contact sheets.

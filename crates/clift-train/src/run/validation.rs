@@ -16,7 +16,7 @@ use clift_scene::TokenCoding;
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::events::{EvalEvents, Event, RunStep, Sink, Stage};
+use crate::events::{Event, RunStep, Sink, Stage, eval_events};
 use crate::footprint::largest_tensor::check_tensors;
 use crate::run::eval_folder::EvalFolder;
 
@@ -104,8 +104,9 @@ impl<'a> Validation<'a> {
             sheet.write_png(&folder.join(format!("step-{step:09}.png")))
         };
         let limits = SceneLimits { num_scenes: settings.num_validation_scenes, num_sheets: 1 };
-        let mut progress = EvalEvents { stop, sink, is_stage: false };
-        let measured = match self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, &mut progress) {
+        let measured =
+            self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, stop, &mut eval_events(sink, false));
+        let measured = match measured {
             Err(EvalError::Interrupted { .. }) => return Ok(false),
             measured => measured?.0,
         };
@@ -125,8 +126,7 @@ impl<'a> Validation<'a> {
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = Instant::now();
-        let mut progress = EvalEvents { stop, sink, is_stage: true };
-        let summary = self.evaluator.evaluate(models, folder.path(), &mut progress)?;
+        let summary = self.evaluator.evaluate(models, folder.path(), stop, &mut eval_events(sink, true))?;
         sink.event(&Event::StepFinished { run_step: RunStep::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }
