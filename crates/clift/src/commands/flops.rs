@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clift_eval::table;
-use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
+use clift_model::{FlopConvention, Macs, TokenCount};
 use clift_train::{Config, check_plan};
 use serde::Serialize;
 
@@ -36,42 +36,26 @@ struct Row {
     attention_macs: u64,
 }
 
-struct Sizes {
-    model: ModelConfig,
-    height: usize,
-    width: usize,
-    num_context: usize,
-    /// Rendered and stored tokens.
-    counts: Vec<TokenCount>,
-}
-
 pub fn run(args: &FlopsArgs) -> anyhow::Result<()> {
-    let read = |path| anyhow::Ok((path, read_config(path, &args.set, check_plan)?.0));
-    let config = args.config.as_deref().map(read).transpose()?;
-    let json = match &config {
-        Some((path, config)) => args.json.open_for(path, config)?,
-        None => args.json.open(&[])?,
+    let (config, json, default) = match args.config.as_deref() {
+        Some(path) => {
+            let (config, _) = read_config(path, &args.set, check_plan)?;
+            let json = args.json.open_for(path, &config)?;
+            let counts: Vec<TokenCount> = config.eval_stored_tokens().into_iter().rev().collect();
+            (config, json, counts)
+        }
+        // The defaults of a config are the sizes of the paper.
+        None => (Config::default(), args.json.open(&[])?, PAPER_TOKENS.map(TokenCount::Count).into()),
     };
-    let sizes = sizes(args, config.map(|(_, config)| config));
-    let counts = count(&sizes, args.convention)?;
+    let tokens = if args.render.is_empty() { default } else { args.render.clone() };
+    let counts = count(&config, &tokens, args.convention)?;
     print_result(&report_text(&counts, args.convention))?;
     json.write(&counts)
 }
 
-fn sizes(args: &FlopsArgs, config: Option<Config>) -> Sizes {
-    let given = |default: Vec<TokenCount>| if args.render.is_empty() { default } else { args.render.clone() };
-    let Some(config) = config else {
-        let counts = given(PAPER_TOKENS.map(TokenCount::Count).into());
-        return Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts };
-    };
-    let counts = given(config.eval_stored_tokens().into_iter().rev().collect());
+fn count(config: &Config, counts: &[TokenCount], convention: FlopConvention) -> anyhow::Result<Counts> {
     let Config { model, data, eval, .. } = config;
-    Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts }
-}
-
-fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
-    let Sizes { model, height, width, num_context, counts } = sizes;
-    let (height, width, num_context) = (*height, *width, *num_context);
+    let (height, width, num_context) = (data.height, data.width, eval.num_context);
     let num_tokens = model.num_tokens(num_context, height, width)?;
     let row = |work, num_tokens, macs: Macs| Row {
         work,
