@@ -11,7 +11,7 @@ use clift_core::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, Network, first_not_f32};
 
 use crate::checkpoint::progress::{Fingerprint, STATE, State, TrainingPosition, VERSION};
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::step::train_state::TrainState;
 
 const MODEL: &str = "model.bpk";
@@ -60,12 +60,11 @@ impl Checkpoints {
         path: &Path,
     ) -> Result<(), TrainError> {
         make_folder(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
-        let failed =
-            |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
-        let record = train_state.model.clone().into_record();
-        record.save(temporary.join(MODEL)).map_err(|error| failed(MODEL, error.to_string()))?;
-        let record = train_state.optimizer.to_record();
-        record.save(temporary.join(OPTIMIZER)).map_err(|error| failed(OPTIMIZER, error.to_string()))?;
+        let [model, optimizer] = [MODEL, OPTIMIZER].map(|name| temporary.join(name));
+        let saved = train_state.model.clone().into_record().save(&model);
+        saved.map_err(std::io::Error::other).map_err(TrainError::io(SAVING, &model))?;
+        let saved = train_state.optimizer.to_record().save(&optimizer);
+        saved.map_err(std::io::Error::other).map_err(TrainError::io(SAVING, &optimizer))?;
         let mut files = BTreeMap::new();
         for name in [MODEL, OPTIMIZER] {
             let file = temporary.join(name);
@@ -95,13 +94,10 @@ impl Checkpoints {
     pub fn load(&self, step: u64, train_state: &mut TrainState) -> Result<TrainingPosition, TrainError> {
         let path = self.path_of(step);
         let state = verify(&path).map_err(|source| {
-            let is_damage = match &source {
-                TrainError::BadFile { .. } => true,
-                TrainError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
-                _ => false,
-            };
-            if !is_damage {
-                return source;
+            match &source {
+                TrainError::BadFile { .. } => {}
+                TrainError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {}
+                _ => return source,
             }
             let is_whole = |older: &u64| *older < step && verify(&self.path_of(*older)).is_ok();
             let fix = match self.steps().unwrap_or_default().into_iter().rfind(is_whole) {
@@ -122,41 +118,36 @@ impl Checkpoints {
     }
 
     fn apply_model(&self, state: &State, folder: &Path, model: Network) -> Result<Network, TrainError> {
-        let bad = |name: &str, reason: String| bad(folder, name, reason);
+        let path = folder.join(MODEL);
         if let (Some(saved), Some(expected)) = (&state.model, &self.model)
             && *expected != (ModelConfig { patch_grids: expected.patch_grids, ..saved.clone() })
         {
-            let value = format!("{expected:?}");
-            return Err(crate::error::bad(
-                "model",
-                value,
-                &format!("{} is of the network {saved:?}", folder.display()),
-            ));
+            let fix = format!("{} is of the network {saved:?}", folder.display());
+            return Err(bad("model", format!("{expected:?}"), &fix));
         }
-        let record = ModuleRecord::load(folder.join(MODEL)).map_err(|error| bad(MODEL, error.to_string()))?;
-        let loaded = caught(&folder.join(MODEL), || model.try_load_record(record))?;
-        let loaded = loaded.map_err(|error| bad(MODEL, format!("{error:?}")))?;
+        let record = ModuleRecord::load(&path).map_err(TrainError::bad_file("checkpoint", &path))?;
+        let loaded = caught(&path, || model.try_load_record(record))?;
+        let loaded = loaded.map_err(|error| bad_file(folder, MODEL, format!("{error:?}")))?;
         if let Some((name, dtype)) = first_not_f32(&loaded) {
-            return Err(bad(MODEL, format!("{name} is {dtype:?}, not F32")));
+            return Err(bad_file(folder, MODEL, format!("{name} is {dtype:?}, not F32")));
         }
         Ok(loaded)
     }
 
     fn apply(&self, state: State, folder: &Path, train_state: &mut TrainState) -> Result<TrainingPosition, TrainError> {
-        let bad = |name: &str, reason: String| bad(folder, name, reason);
         train_state.model = self.apply_model(&state, folder, train_state.model.clone())?;
         let State { progress, loss_scale, .. } = state;
-        let record =
-            OptimizerRecord::load(folder.join(OPTIMIZER)).map_err(|error| bad(OPTIMIZER, error.to_string()))?;
+        let path = folder.join(OPTIMIZER);
+        let record = OptimizerRecord::load(&path).map_err(TrainError::bad_file("checkpoint", &path))?;
         let num_tensors = record.len();
-        let loaded = caught(&folder.join(OPTIMIZER), || train_state.optimizer.clone().load_record(record))?;
+        let loaded = caught(&path, || train_state.optimizer.clone().load_record(record))?;
         if loaded.to_record().len() != num_tensors {
             // Burn ignores unknown tensors.
-            return Err(bad(OPTIMIZER, "the file is not a record of this optimizer".into()));
+            return Err(bad_file(folder, OPTIMIZER, "the file is not a record of this optimizer"));
         }
         train_state.optimizer = loaded;
         if loss_scale.is_some_and(|scale| !scale.is_possible()) {
-            return Err(bad(STATE, "the loss scale is not a power of two from 1 to 2^32".into()));
+            return Err(bad_file(folder, STATE, "the loss scale is not a power of two from 1 to 2^32"));
         }
         // The config sets the precision.
         if train_state.loss_scale.is_some() && loss_scale.is_some() {
@@ -221,7 +212,7 @@ fn remove_if_present(folder: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
-fn bad(folder: &Path, name: &str, reason: String) -> TrainError {
+fn bad_file(folder: &Path, name: &str, reason: impl std::fmt::Display) -> TrainError {
     TrainError::bad_file("checkpoint", &folder.join(name))(reason)
 }
 
@@ -229,14 +220,14 @@ fn bad(folder: &Path, name: &str, reason: String) -> TrainError {
 fn verify(folder: &Path) -> Result<State, TrainError> {
     let state = State::read(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !state.files.contains_key(*name)) {
-        return Err(bad(folder, STATE, format!("the checksum of {name} is missing")));
+        return Err(bad_file(folder, STATE, format!("the checksum of {name} is missing")));
     }
     for (name, expected) in &state.files {
         let file = folder.join(name);
         let found = Fingerprint::of(&file).map_err(TrainError::io(LOADING, &file))?;
         if found != *expected {
             let reason = format!("{} bytes with other contents, {} expected", found.num_bytes, expected.num_bytes);
-            return Err(bad(folder, name, reason));
+            return Err(bad_file(folder, name, reason));
         }
     }
     Ok(state)
@@ -285,23 +276,6 @@ mod tests {
         );
     }
 
-    #[test]
-    fn foreign_optimizer_and_missing_checksum_are_refused() {
-        let place = tempfile::tempdir().unwrap();
-        let (mut train_state, checkpoints, step) = saved(place.path());
-        // Weights of the model in the file of the optimizer, with a matching checksum.
-        std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).unwrap();
-        update_checksum(&step, OPTIMIZER);
-        let message = checkpoints.load(1, &mut train_state).unwrap_err().to_string();
-        assert!(!message.contains("damaged"), "{message}");
-
-        let mut state = State::read(&step).unwrap();
-        state.files.remove(MODEL);
-        state.write(&step).unwrap();
-        let message = checkpoints.load(1, &mut train_state).unwrap_err().to_string();
-        assert!(message.contains("the checksum of model.bpk is missing"), "{message}");
-    }
-
     struct ToF64;
     impl ModuleMapper for ToF64 {
         fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
@@ -310,14 +284,24 @@ mod tests {
     }
 
     #[test]
-    fn weights_of_other_types_are_refused() {
+    fn wrong_files_with_right_checksums_and_missing_checksums_are_refused() {
         let place = tempfile::tempdir().unwrap();
         let (mut train_state, checkpoints, step) = saved(place.path());
         let wide = train_state.model.valid().map(&mut ToF64);
+        let mut message = || checkpoints.load(1, &mut train_state).unwrap_err().to_string();
+        // Weights of the model in the file of the optimizer.
+        std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).unwrap();
+        update_checksum(&step, OPTIMIZER);
+        assert!(!message().contains("damaged"), "{}", message());
+
         wide.into_record().save(step.join(MODEL)).unwrap();
         update_checksum(&step, MODEL);
-        let message = checkpoints.load(1, &mut train_state).unwrap_err().to_string();
-        assert!(message.contains("is F64, not F32"), "{message}");
+        assert!(message().contains("is F64, not F32"), "{}", message());
+
+        let mut state = State::read(&step).unwrap();
+        state.files.remove(MODEL);
+        state.write(&step).unwrap();
+        assert!(message().contains("the checksum of model.bpk is missing"), "{}", message());
     }
 
     #[test]

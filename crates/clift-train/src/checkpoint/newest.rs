@@ -30,7 +30,7 @@ impl NewestCheckpoint {
         }
         for stage in [Stage::Stage2, Stage::Stage1] {
             let folder = run.join(stage.name());
-            let checkpoints = checkpoints(run, stage);
+            let checkpoints = Checkpoints { folder: folder.join("checkpoints"), model: None };
             match checkpoints.newest_step()? {
                 _ if folder.join("model.safetensors").exists() => return Ok(None),
                 Some(step) => return Ok(Some(Self { stage, step, path: checkpoints.path_of(step) })),
@@ -43,13 +43,9 @@ impl NewestCheckpoint {
     /// Reads the model, with a trained condenser in stage 2.
     pub fn open(&self, config: &Config, run: &Path, device: &Device) -> Result<TrainedModel, TrainError> {
         let initial = Network::new(&config.model, config.seed, device);
-        let checkpoints = Checkpoints { model: Some(config.model.clone()), ..checkpoints(run, self.stage) };
+        let folder = run.join(self.stage.name()).join("checkpoints");
+        let checkpoints = Checkpoints { folder, model: Some(config.model.clone()) };
         let network = checkpoints.load_model(self.step, initial)?;
         Ok(TrainedModel::snapshot(&network, &config.model, self.stage == Stage::Stage2))
     }
-}
-
-fn checkpoints(run: &Path, stage: Stage) -> Checkpoints {
-    let folder = run.join(stage.name()).join("checkpoints");
-    Checkpoints { folder, model: None }
 }
