@@ -11,7 +11,7 @@ use crate::{config, gpu};
 /// Two scenes of 12 tokens: of stage 1, where each view has `kept` of them, or of stage 2 without `kept`.
 fn batch(kept: Option<u32>) -> StageBatch {
     let shape = ClipShape { num_context: 2, num_targets: 2, size: [16, 24] };
-    let batch = seeded_batch(shape, 2, 12, Some(3), 0).expect("valid sizes");
+    let batch = seeded_batch(shape, 2, Some([12, 3]), 0).expect("valid sizes");
     let Some(kept) = kept else { return batch };
     // Views share some.
     let view = |start: u32| (0..kept).map(|i| (start + 5 * i) % 12).collect::<Vec<_>>();

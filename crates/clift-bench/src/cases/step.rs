@@ -5,8 +5,8 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use clift_model::{Network, Precision};
 use clift_train::{
-    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageOptimizer, StageSettings, StepAnomaly, TrainError,
-    TrainState, freeze, learning_rate, render_loss, seeded_batch,
+    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, StepAnomaly, TrainError, TrainState, freeze,
+    learning_rate, render_loss, seeded_batch,
 };
 
 use crate::cases::context::BenchContext;
@@ -28,9 +28,14 @@ pub struct StepCase {
 impl StepCase {
     pub fn new(context: &BenchContext, stage: Stage) -> Result<Self, TrainError> {
         let StageSettings { steps, batch_size, accumulate, optimizer, .. } = context.config.stage(stage);
+        let precision = context.config.precision;
+        let model = freeze(stage, context.model());
+        // Without the VGG network of a perceptual term.
+        let plain = TrainState::new(model, optimizer, context.device.clone().autodiff());
+        let state = TrainState { precision, loss_scale: LossScale::of(precision), ..plain };
         Ok(Self {
             stage,
-            state: Some(train_state(context, stage)),
+            state: Some(state),
             batch: stage_batch(context, stage, batch_size)?,
             accumulate,
             rate: learning_rate(optimizer, 1, steps),
@@ -40,22 +45,11 @@ impl StepCase {
     }
 }
 
-/// Makes the state of a stage before its first update, without the VGG network of a perceptual term.
-fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
-    TrainState {
-        model: freeze(stage, context.model()),
-        optimizer: StageOptimizer::new(context.config.stage(stage).optimizer, &context.device),
-        device: context.device.clone().autodiff(),
-        loss: Loss::default(),
-        precision: context.config.precision,
-        loss_scale: LossScale::of(context.config.precision),
-    }
-}
-
 /// Makes a batch with all tokens (stage 1) or with stored tokens (stage 2).
 fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Result<StageBatch, TrainError> {
-    let stored = if stage == Stage::Stage2 { Some(context.num_storage_tokens()?) } else { None };
-    seeded_batch(context.shape(), batch_size, context.num_tokens()?, stored, context.config.seed)
+    let is_stage2 = stage == Stage::Stage2;
+    let clusters = if is_stage2 { Some([context.num_tokens()?, context.num_storage_tokens()?]) } else { None };
+    seeded_batch(context.shape(), batch_size, clusters, context.config.seed)
 }
 
 impl BenchTask for StepCase {

@@ -86,7 +86,7 @@ fn gradient(device: &Device) -> Result<(f64, Vec<f64>), TrainError> {
     let shape = ClipShape { num_context: 2, num_targets: 1, size: [16, 16] };
     let num_tokens = config.num_tokens(2, 16, 16)?;
     let model = seeded_model(&config, 0, device);
-    let batch = seeded_batch(shape, 1, num_tokens, Some(num_tokens / 4), 0)?;
+    let batch = seeded_batch(shape, 1, Some([num_tokens, num_tokens / 4]), 0)?;
     // The clusters of the batch are random: those of K-means may depend on the last bit of a distance.
     let views = Views::upload(&[&batch.clips[0].context], device)?;
     KMeans::default().fit(model.valid().encode(&views).values, num_tokens / 4, &[0])?;

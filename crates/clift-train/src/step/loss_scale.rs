@@ -103,7 +103,7 @@ mod tests {
             num_renderer_blocks: 1,
             ..ModelConfig::default()
         };
-        let batch = seeded_batch(ClipShape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
+        let batch = seeded_batch(ClipShape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, None, 1).unwrap();
         let new_state = |precision: Precision, loss_scale: Option<LossScale>| {
             let model = freeze(Stage::Stage1, seeded_model(&sizes, 3, &device));
             let plain = TrainState::new(model, &OptimizerConfig::default(), device.clone().autodiff());

@@ -80,17 +80,16 @@ pub fn seeded_clusters(
     Ok(SceneClusters::new(assignment, centroid_index)?)
 }
 
-/// Makes a batch of stage 1 with all tokens, or of stage 2 if `num_storage_tokens` is given.
+/// Makes a batch of stage 1 with all tokens, or of stage 2 if the numbers of tokens and of clusters of a scene are given.
 pub fn seeded_batch(
     shape: ClipShape,
     batch_size: usize,
-    num_tokens: usize,
-    num_storage_tokens: Option<usize>,
+    clusters: Option<[usize; 2]>,
     seed: u64,
 ) -> Result<StageBatch, TrainError> {
-    let tokens = match num_storage_tokens {
+    let tokens = match clusters {
         None => BatchTokens::All,
-        Some(count) => {
+        Some([num_tokens, count]) => {
             let scenes = (0..batch_size).map(|slot| seeded_clusters(num_tokens, count, seed, slot));
             BatchTokens::Clusters(scenes.collect::<Result<_, _>>()?)
         }

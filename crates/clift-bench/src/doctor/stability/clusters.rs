@@ -2,11 +2,11 @@
 
 use burn::tensor::Tensor;
 use clift_model::{KMeans, SceneClusters};
-use clift_train::{BatchTokens, Stage, TrainError, seeded_batch, seeded_clusters, seeded_uniform};
+use clift_train::{BatchTokens, Stage, TrainError, seeded_clusters, seeded_uniform};
 
 use crate::cases::reference::{ToF64, values};
 use crate::doctor::stability::case::{CaseDevices, StabilityCase};
-use crate::doctor::stability::updates::{num_tokens, shape, stage_error};
+use crate::doctor::stability::updates::{batch, network, stage_error};
 
 pub(crate) const CASES: &[StabilityCase] = &[
     StabilityCase {
@@ -58,8 +58,9 @@ fn condenser_error(
     devices: &CaseDevices,
     scene: impl Fn(usize) -> Result<SceneClusters, TrainError>,
 ) -> Result<f64, TrainError> {
-    let num_tokens = num_tokens(devices, 4);
-    let mut batch = seeded_batch(shape(devices, 4), 2, num_tokens, None, 0)?;
+    let (mut batch, config) = (batch(devices, 4, 2)?, network(devices));
+    let views = &batch.clips[0].context;
+    let num_tokens = config.num_tokens(views.num_views(), views.height, views.width)?;
     batch.tokens = BatchTokens::Clusters(vec![scene(num_tokens)?; 2]);
-    stage_error(devices, Stage::Stage2, &batch)
+    stage_error(devices, &config, Stage::Stage2, &batch)
 }

@@ -92,46 +92,42 @@ pub(crate) fn network(devices: &CaseDevices) -> ModelConfig {
     }
 }
 
-/// Returns the views of a scene: `num_context` contexts and two targets, one target for one context.
-pub(crate) fn shape(devices: &CaseDevices, num_context: usize) -> ClipShape {
-    let side = devices.size.pick(16, 64);
-    ClipShape { num_context, num_targets: if num_context == 1 { 1 } else { 2 }, size: [side, side] }
-}
-
-pub(crate) fn num_tokens(devices: &CaseDevices, num_context: usize) -> usize {
-    let [height, width] = shape(devices, num_context).size;
-    num_context * (height / 8) * (width / 8)
+/// Returns a batch of scenes of `num_context` contexts and two targets, one target for one context.
+pub(crate) fn batch(devices: &CaseDevices, num_context: usize, num_scenes: usize) -> Result<StageBatch, TrainError> {
+    let (side, num_targets) = (devices.size.pick(16, 64), if num_context == 1 { 1 } else { 2 });
+    seeded_batch(ClipShape { num_context, num_targets, size: [side, side] }, num_scenes, None, 0)
 }
 
 fn changed_views(devices: &CaseDevices, num_context: usize, change: impl Fn(&mut Clip)) -> Result<f64, TrainError> {
-    let mut batch: StageBatch =
-        seeded_batch(shape(devices, num_context), 1, num_tokens(devices, num_context), None, 0)?;
-    batch.clips.iter_mut().for_each(change);
-    stage_error(devices, Stage::Stage1, &batch)
+    network_error(devices, &network(devices), num_context, change)
 }
 
 /// Returns the error of an update on changed views with camera-relative attention; heads of 8 or 16 channels.
 fn relative_views(devices: &CaseDevices, change: impl Fn(&mut Clip)) -> Result<f64, TrainError> {
-    let mut batch = seeded_batch(shape(devices, 4), 1, num_tokens(devices, 4), None, 0)?;
-    batch.clips.iter_mut().for_each(change);
     let (camera_encoding, num_heads) = (CameraEncoding::Gta, devices.size.pick(2, 4));
     let config = ModelConfig { camera_encoding, num_heads, ..network(devices) };
-    network_error(devices, &config, Stage::Stage1, &batch)
+    network_error(devices, &config, 4, change)
 }
 
 fn lvsm_views(devices: &CaseDevices) -> Result<f64, TrainError> {
-    let batch = seeded_batch(shape(devices, 4), 1, num_tokens(devices, 4), None, 0)?;
     let (num_latents, condenser) = (devices.size.pick(5, 64), CondenserConfig::NONE);
     let architecture = Architecture::LvsmEd;
     let config = ModelConfig { architecture, num_latents, condenser, ..network(devices) };
-    network_error(devices, &config, Stage::Stage1, &batch)
-}
-
-pub(crate) fn stage_error(devices: &CaseDevices, stage: Stage, batch: &StageBatch) -> Result<f64, TrainError> {
-    network_error(devices, &network(devices), stage, batch)
+    network_error(devices, &config, 4, |_| ())
 }
 
 fn network_error(
+    devices: &CaseDevices,
+    config: &ModelConfig,
+    num_context: usize,
+    change: impl Fn(&mut Clip),
+) -> Result<f64, TrainError> {
+    let mut batch = batch(devices, num_context, 1)?;
+    batch.clips.iter_mut().for_each(change);
+    stage_error(devices, config, Stage::Stage1, &batch)
+}
+
+pub(crate) fn stage_error(
     devices: &CaseDevices,
     config: &ModelConfig,
     stage: Stage,
