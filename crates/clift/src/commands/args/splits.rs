@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::commands::args::parse::parse_input;
 use crate::output::counter::scan_counter;
-use crate::output::stdout::print_note;
 
 /// The config keys that `--set` accepts for a data set: `data.files.*`.
 #[derive(Debug, Default, Deserialize, Serialize)]
@@ -58,12 +57,6 @@ impl SplitSource {
     /// Returns the display name: `train`, `test` or `scenes`.
     pub fn name(&self) -> String {
         self.split.map_or_else(|| "scenes".into(), |split| split.to_string())
-    }
-
-    pub fn print_report(&self) {
-        if self.opened.report.has_content() {
-            print_note(&format!("{}: {}", self.name(), self.opened.report));
-        }
     }
 }
 

@@ -7,7 +7,7 @@ use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 use crate::commands::args::parse::{parse_distance, parse_output};
 use crate::commands::args::splits::{SourceArgs, Splits};
 use crate::output::output_file::OutputFile;
-use crate::output::stdout::print_result;
+use crate::output::stdout::{print_note, print_result};
 
 pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     let options = OverlapOptions {
@@ -20,8 +20,8 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     options.validate()?;
     OutputFile::new(&args.out, args.force, &[&args.source.dir])?;
     let splits = args.source.open(args.split)?;
-    for split in &splits {
-        split.print_report();
+    for split in splits.iter().filter(|split| split.opened.report.has_content()) {
+        print_note(&format!("{}: {}", split.name(), split.opened.report));
     }
     let sources: Vec<&dyn SceneSource> = splits.iter().map(|split| split.opened.source.as_ref()).collect();
     let report = write_overlap_index(&args.out, &sources, &options)?;
