@@ -27,13 +27,9 @@ impl<'a> SourceText<'a> {
         Self { files, texts }
     }
 
-    /// Returns the overrides with leading blanks, which shift their spans behind those of the file.
-    pub(crate) fn padded_overrides(&self) -> Vec<String> {
-        self.texts[1..].iter().map(|(start, text)| format!("{}{text}", " ".repeat(*start))).collect()
-    }
-
-    pub(crate) fn override_start(&self, index: usize) -> usize {
-        self.texts[index + 1].0
+    /// Returns the overrides, each with its start and behind as many blanks, which shift its spans behind those of the file.
+    pub(crate) fn padded_overrides(&self) -> Vec<(usize, String)> {
+        self.texts[1..].iter().map(|(start, text)| (*start, format!("{}{text}", " ".repeat(*start)))).collect()
     }
 
     pub(crate) fn at(&self, span: Range<usize>, title: String, label: String) -> Diagnostic<usize> {

@@ -93,16 +93,15 @@ pub fn parse_config<T: DeserializeOwned + Serialize>(
 fn merged<'t>(
     sources: &SourceText,
     file: &'t str,
-    padded: &'t [String],
+    padded: &'t [(usize, String)],
 ) -> Result<(Spanned<DeTable<'t>>, Vec<String>), ConfigError> {
     let invalid = |diagnostic: &_| ConfigError::Invalid(sources.render(diagnostic));
     let mut root = DeTable::parse(file).map_err(|error| {
         invalid(&sources.at(error.span().unwrap_or(0..0), "the file is not TOML".into(), error.message().into()))
     })?;
     let mut set_keys = Vec::new();
-    for (index, text) in padded.iter().enumerate() {
-        let start = sources.override_start(index);
-        let (key, value) = parse_override(sources, text, start).map_err(|diagnostic| invalid(&diagnostic))?;
+    for (start, text) in padded {
+        let (key, value) = parse_override(sources, text, *start).map_err(|diagnostic| invalid(&diagnostic))?;
         merge_value(root.get_mut(), &key, value).map_err(|blocked| {
             let title = format!("`{}` is a value, not a section", blocked.get_ref());
             invalid(&sources.at(blocked.span(), title, "cannot hold a key".into()))
