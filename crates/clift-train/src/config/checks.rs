@@ -157,18 +157,16 @@ impl Config {
 fn validate_data(data: &DataConfig) -> Result<(), BadConfig> {
     in_range("data.num_threads", data.num_threads.unwrap_or(0), 0, 1024)?;
     in_range("data.num_prefetch", data.num_prefetch, 1, 1024)?;
-    if data.source == SourceKind::Synthetic {
-        if let Some(root) = data.root.as_ref().filter(|root| !root.as_os_str().is_empty()) {
-            let fix = "synthetic scenes are read from no folder: write data.source = \"auto\", or remove the key";
-            return Err(BadConfig::new("data.root", root.display(), fix));
-        }
-        return validate_synthetic(data);
+    if data.source != SourceKind::Synthetic {
+        check_config(data.root.is_some(), "data.root", "missing", || {
+            "write the folder of the data set or capture".into()
+        })?;
+        return data.filters.validate().map_err(|error| error.in_section("data.filters"));
     }
-    check_config(data.root.is_some(), "data.root", "missing", || "write the folder of the data set or capture".into())?;
-    data.filters.validate().map_err(|error| error.in_section("data.filters"))
-}
-
-fn validate_synthetic(data: &DataConfig) -> Result<(), BadConfig> {
+    if let Some(root) = data.root.as_ref().filter(|root| !root.as_os_str().is_empty()) {
+        let fix = "synthetic scenes are read from no folder: write data.source = \"auto\", or remove the key";
+        return Err(BadConfig::new("data.root", root.display(), fix));
+    }
     let synthetic = &data.synthetic;
     synthetic.validate().map_err(|error| error.in_section("data.synthetic"))?;
     if synthetic.width < data.width || synthetic.height < data.height {
