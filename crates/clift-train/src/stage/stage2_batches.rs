@@ -69,12 +69,8 @@ impl Stage2Batches {
     fn sample_group(&self, step: u64) -> &[usize] {
         let total = self.groups.iter().map(Vec::len).sum();
         let index = uniform_below(&mut step_rng(self.seed, step, "token count"), total);
-        let ends = self.groups.iter().scan(0, |end, group| {
-            *end += group.len();
-            Some(*end)
-        });
-        let found = self.groups.iter().zip(ends).find(|(_, end)| index < *end);
-        found.map(|(group, _)| group.as_slice()).unwrap_or_default()
+        let mut of_entries = self.groups.iter().flat_map(|group| std::iter::repeat_n(group, group.len()));
+        of_entries.nth(index).expect("an index of an entry")
     }
 
     fn fill_slot(
