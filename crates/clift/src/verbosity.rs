@@ -1,32 +1,26 @@
 //! How much goes to the standard error: the option `--quiet`.
 
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 /// Amount of notes and progress.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(u8)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verbosity {
     /// Errors and warnings only.
-    Quiet = 0,
+    Quiet,
     /// Notes and progress, too.
-    #[default]
-    Normal = 1,
+    Normal,
     /// Nothing, errors included: rank 0 prints for all.
-    Silent = 2,
+    Silent,
 }
 
-static CHOSEN: AtomicU8 = AtomicU8::new(Verbosity::Normal as u8);
+static CHOSEN: Mutex<Verbosity> = Mutex::new(Verbosity::Normal);
 
 impl Verbosity {
     pub fn choose(self) {
-        CHOSEN.store(self as u8, Ordering::Relaxed);
+        *CHOSEN.lock().unwrap_or_else(PoisonError::into_inner) = self;
     }
 
     pub fn chosen() -> Self {
-        match CHOSEN.load(Ordering::Relaxed) {
-            0 => Self::Quiet,
-            2 => Self::Silent,
-            _ => Self::Normal,
-        }
+        *CHOSEN.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
