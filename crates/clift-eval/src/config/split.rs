@@ -1,21 +1,23 @@
 //! The evaluated scenes and frames, and whether training has seen them.
 
-use std::fmt;
-
 use clift_data::{DataError, EvaluationItem, OpenedSource, SceneSource, Split, ViewIndices, even_views, even_views_of};
 use serde::{Deserialize, Serialize};
 
 /// What the figures of an evaluation were measured on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, strum::Display)]
 #[serde(rename_all = "snake_case")]
 pub enum EvalSplit {
     /// Scenes of the test split.
+    #[strum(to_string = "test split")]
     Test,
     /// Frames of the training scenes that training never reads (`data.hold_out`).
+    #[strum(to_string = "held-out frames of training scenes")]
     HeldOutFrames,
     /// Training scenes, with frames that training reads.
+    #[strum(to_string = "training scenes")]
     Train,
     /// A data set without splits that is not the training data.
+    #[strum(to_string = "data set without splits")]
     OtherData,
 }
 
@@ -23,17 +25,6 @@ impl EvalSplit {
     /// Returns a warning if the figures do not measure generalization.
     pub fn warning(self) -> Option<&'static str> {
         (self == Self::Train).then_some("measured on training scenes: the figures do not show how the run generalizes")
-    }
-}
-
-impl fmt::Display for EvalSplit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Test => "test split",
-            Self::HeldOutFrames => "held-out frames of training scenes",
-            Self::Train => "training scenes",
-            Self::OtherData => "data set without splits",
-        })
     }
 }
 

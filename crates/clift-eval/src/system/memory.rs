@@ -17,19 +17,14 @@ pub fn keep_freed_memory() {
 
 /// Resets the peak to the current resident memory. Returns `None` where the system has no resettable peak.
 pub fn start_peak() -> Option<()> {
-    release_free_memory();
-    // 5 resets the "high water mark" (proc(5)).
-    std::fs::write("/proc/self/clear_refs", "5").ok()
-}
-
-/// Returns freed memory to the system. glibc keeps freed memory otherwise, and a bench row after an f64 comparison would
-/// count the memory of the comparison.
-fn release_free_memory() {
+    // glibc keeps freed memory otherwise, and a bench row after an f64 comparison would count the memory of the comparison.
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     // SAFETY: any thread may call malloc_trim at any time (malloc_trim(3)); the call touches only free memory.
     unsafe {
         libc::malloc_trim(0);
     }
+    // 5 resets the "high water mark" (proc(5)).
+    std::fs::write("/proc/self/clear_refs", "5").ok()
 }
 
 /// Returns the peak of the resident memory since [`start_peak`], in bytes.
