@@ -48,10 +48,6 @@ impl Sheets {
     }
 }
 
-fn sheet_name(key: &str) -> String {
-    format!("{}.png", distinct_file_name(key))
-}
-
 /// Largest number of characters of a scene key in a file name. File systems allow 255 bytes, with the ending.
 const MAX_KEY_CHARS: usize = 120;
 
@@ -64,12 +60,12 @@ pub fn file_name(key: &str) -> String {
     if name.len() <= MAX_KEY_CHARS { name } else { format!("{}-{:016x}", &name[..MAX_KEY_CHARS], derive_seed(0, key)) }
 }
 
-/// Returns a scene key as a file name of its own: [`file_name`], with a hash of the key if that is another text, so that the
+/// Returns the file name of the sheet of a scene: [`file_name`], with a hash of the key if that is another text, so that the
 /// files of `a/b` and `a_b` differ.
-fn distinct_file_name(key: &str) -> String {
+fn sheet_name(key: &str) -> String {
     let name = file_name(key);
     let has_hash = name.len() > MAX_KEY_CHARS;
-    if name == key || has_hash { name } else { format!("{name}-{:08x}", derive_seed(0, key) as u32) }
+    if name == key || has_hash { name + ".png" } else { format!("{name}-{:08x}.png", derive_seed(0, key) as u32) }
 }
 
 #[cfg(test)]
@@ -82,7 +78,7 @@ mod tests {
         let [a, b] = ["a", "b"].map(|end| file_name(&format!("{}{end}", "room".repeat(1250))));
         assert!(a.len() < 200 && b.len() == a.len() && a != b, "{a} {b}");
         assert_eq!(file_name(&"x".repeat(120)), "x".repeat(120));
-        let names = ["a/b", "a_b", "a?b"].map(distinct_file_name);
-        assert!(names[1] == "a_b" && names.iter().collect::<BTreeSet<_>>().len() == 3, "{names:?}");
+        let names = ["a/b", "a_b", "a?b"].map(sheet_name);
+        assert!(names[1] == "a_b.png" && names.iter().collect::<BTreeSet<_>>().len() == 3, "{names:?}");
     }
 }
