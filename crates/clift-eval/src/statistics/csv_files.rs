@@ -51,8 +51,8 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
         let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
         views.map(move |(scene, (&target_frame, view))| {
             let ViewMetrics { psnr, ssim, lpips_vgg, sharpness, render_s, select_s } = *view;
-            let scene = scene.clone();
             ViewRow {
+                scene: scene.clone(),
                 target_frame,
                 method,
                 num_storage_tokens,
@@ -64,8 +64,7 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
                 render_s,
                 select_s,
                 tokens,
-                context_frames: results.context_list(&scene),
-                scene,
+                context_frames: results.context_list(scene),
             }
         })
     });
