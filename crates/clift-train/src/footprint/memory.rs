@@ -35,12 +35,8 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
     Ok(largest.map(|(bytes, run_step)| {
         let [bytes, available] = [bytes, available].map(|bytes| bytes as f64 / f64::from(1 << 30));
         let (name, device) = (run_step.name(), config.device);
-        let more = match run_step {
-            RunStep::Train(stage) if config.stage(stage).micro_batch_size() > 1 => {
-                format!("a larger {name}.accumulate, ")
-            }
-            _ => String::new(),
-        };
+        let has_parts = matches!(run_step, RunStep::Train(stage) if config.stage(stage).micro_batch_size() > 1);
+        let more = if has_parts { format!("a larger {name}.accumulate, ") } else { String::new() };
         format!(
             "{name} needs about {bytes:.1} GiB, and {device} has {available:.1} GiB available: choose {more}fewer or \
              smaller views"
