@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage, StepEvent};
-use crate::step::step_guard::SkippedStep;
 
 /// A file of JSON lines, at most one per step. Every line is flushed; a killed run loses at most the last one.
 #[derive(Debug, Default)]
@@ -135,7 +134,7 @@ pub struct RunLog<'a> {
     sink: &'a mut dyn Sink,
     metrics: StepLines,
     validations: StepLines,
-    bad_steps: StepLines,
+    pub bad_steps: StepLines,
     skips: StepLines,
     skipped: HashSet<String>,
 }
@@ -172,10 +171,6 @@ impl<'a> RunLog<'a> {
             self.sink.event(&Event::Skipped { key: skip.key.clone(), reason: skip.reason.clone() });
             self.skips.write(&SkipLine { step, stage, skip: skip.clone() });
         }
-    }
-
-    pub fn bad_step(&mut self, line: &SkippedStep) {
-        self.bad_steps.write(line);
     }
 
     /// Flushes all lines to the disk. Must succeed before a checkpoint is saved, or a resumed run would lack lines.

@@ -257,7 +257,7 @@ impl TrainLoop<'_> {
             in_a_row: self.progress.bad_steps,
             scenes: batch.scenes.clone(),
         };
-        self.log.bad_step(&line);
+        self.log.bad_steps.write(&line);
         let keys = line.scenes.iter().map(|scene| scene.key.as_str()).collect::<Vec<_>>().join(", ");
         let TrainingPosition { step, bad_steps: count, .. } = self.progress;
         if count < self.plan.settings.optimizer.max_bad_steps {
