@@ -156,11 +156,9 @@ fn path_cameras(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -
         Some("orbit") => orbit_path(&context, args.frames.unwrap_or(DEFAULT_FRAMES)),
         _ => {
             let file = &args.path;
-            if !file.exists() {
-                usage_bail!("--path {}: no such file; write interpolate, orbit or a file of poses", file.display());
-            }
-            if file.is_dir() {
-                usage_bail!("--path {}: a folder; write interpolate, orbit or a file of poses", file.display());
+            if file.is_dir() || !file.exists() {
+                let what = if file.is_dir() { "a folder" } else { "no such file" };
+                usage_bail!("--path {}: {what}; write interpolate, orbit or a file of poses", file.display());
             }
             if args.frames.is_some() {
                 usage_bail!("a file of poses determines the number of frames; remove --frames");
