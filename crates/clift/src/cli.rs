@@ -17,7 +17,6 @@ use crate::commands::plan::PlanArgs;
 use crate::commands::render::RenderArgs;
 use crate::commands::train::TrainArgs;
 use crate::commands::view::ViewArgs;
-use crate::verbosity::Verbosity;
 
 /// Train, compress, render and evaluate scenes of compressive light-field tokens
 #[derive(Debug, Parser)]
@@ -43,13 +42,6 @@ pub struct Args {
     /// Print results, warnings and errors only
     #[arg(short, long, global = true)]
     pub quiet: bool,
-}
-
-impl Args {
-    /// Returns the amount of notes and progress.
-    pub fn verbosity(&self) -> Verbosity {
-        if self.quiet { Verbosity::Quiet } else { Verbosity::Normal }
-    }
 }
 
 /// The commands.

@@ -31,13 +31,16 @@ use crate::commands::{
 };
 use crate::exit_code::{DONE, error_message, exit_code};
 use crate::output::stdout;
+use crate::verbosity::Verbosity;
 
 /// Runs the command line of this process and returns the exit code: 0 done, 1 failed, 2 invalid command line, config or
 /// model, 129 (closed terminal), 130 (Ctrl-C) or 143 (SIGTERM) interrupted.
 pub fn main() -> ExitCode {
     quiet_mesa();
     let args = Args::parse();
-    args.verbosity().choose();
+    if args.quiet {
+        Verbosity::Quiet.choose();
+    }
     keep_freed_memory();
     threads::flush_subnormals(|| run(args))
 }

@@ -14,7 +14,7 @@ use crate::commands::args::parse::parse_training_step;
 use crate::commands::args::shared_args::ConfigArgs;
 use crate::interrupt::{self, Ending};
 use crate::output::progress::progress_sink;
-use crate::output::stdout::{name_adapter, print_run, print_warning};
+use crate::output::stdout::{name_adapter, print_evaluation, print_result, print_warning};
 use crate::output::units::duration;
 use crate::threads;
 use crate::verbosity::Verbosity;
@@ -71,11 +71,13 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
             sink.event(&Event::Message(text));
         }
     };
-    let (run_dir, supports_clusters) = (config.run_dir.clone(), config.model.architecture.supports_clusters());
+    let (run_dir, has_view) = (config.run_dir.clone(), config.model.architecture.supports_clusters());
     let run = Run::open_on(ranks.clone(), config, &options, &mut sink)?;
     let summary = run.train(args.only, &stop, &mut sink)?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir, supports_clusters))
+    let Some(summary) = summary else { return Ok(()) };
+    print_evaluation(&summary, &run_dir.join("eval"))?;
+    if has_view { print_result(&format!("scenes: clift view {}", run_dir.display())) } else { Ok(()) }
 }
 
 #[derive(Debug, clap::Args)]

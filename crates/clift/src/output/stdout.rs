@@ -16,12 +16,6 @@ pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
 
-/// Writes the result of a run, and the command that shows its scenes, if the viewer can.
-pub fn print_run(summary: &Summary, run: &Path, has_view: bool) -> anyhow::Result<()> {
-    print_evaluation(summary, &run.join("eval"))?;
-    if has_view { print_result(&format!("scenes: clift view {}", run.display())) } else { Ok(()) }
-}
-
 /// Writes the table of an evaluation and the paths of its report and files.
 pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
     let report = folder.join("report.html");

@@ -13,10 +13,8 @@ pub(crate) fn parse_split(text: &str) -> Result<Split, String> {
 
 pub(crate) fn parse_training_step(text: &str) -> Result<RunStep, String> {
     let steps = [Stage::Stage1.into(), RunStep::Clusters, Stage::Stage2.into()];
-    steps
-        .into_iter()
-        .find(|step: &RunStep| step.name() == text)
-        .ok_or_else(|| "write stage1, clusters or stage2".into())
+    let found = steps.into_iter().find(|step: &RunStep| step.name() == text);
+    found.ok_or_else(|| "write stage1, clusters or stage2".into())
 }
 
 pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
