@@ -63,18 +63,10 @@ mod tests {
     use crate::statistics::view_metrics::ViewMetrics;
     use crate::testing::f32_key as key;
 
-    fn differences_of(rows: &[(&str, usize, EvalKey, f64)]) -> Vec<PairedDifference> {
-        let mut results = EvalResults::default();
-        for &(scene, frame, key, psnr) in rows {
-            results.add(scene, frame, key, ViewMetrics::quality(psnr, None));
-        }
-        differences(&results)
-    }
-
     #[test]
     fn scenes_are_paired_at_equal_counts() {
         let (better, worse) = (key(Method::Kmeans, 8, 8), key(Method::Random, 8, 8));
-        let differences = differences_of(&[
+        let rows = [
             ("attic", 1, better, 21.0),
             ("attic", 2, better, 24.0),
             ("attic", 1, worse, 20.0),
@@ -88,7 +80,12 @@ mod tests {
             // A single scene.
             ("attic", 1, key(Method::Kmeans, 16, 16), 22.0),
             ("attic", 1, key(Method::Clift, 16, 16), f64::INFINITY),
-        ]);
+        ];
+        let mut results = EvalResults::default();
+        for (scene, frame, key, psnr) in rows {
+            results.add(scene, frame, key, ViewMetrics::quality(psnr, None));
+        }
+        let differences = differences(&results);
         let rows = differences.iter().map(|d| (d.method, d.num_storage_tokens, d.num_scenes, d.psnr, d.psnr_stderr));
         // 2 dB in the attic, -1 dB in the cellar; an infinite PSNR counts as 100 dB.
         let expected = [(Method::Kmeans, 8, 2, 0.5, Some(1.5)), (Method::Clift, 16, 1, 78.0, None)];

@@ -119,11 +119,6 @@ mod tests {
 
     const FILE: &str = "[data]\n[stage1]\nsteps = 90000\n[stage2]\n[cluster]\n";
 
-    fn parse(file: &str, overrides: &[&str]) -> Result<(Config, Vec<String>), ConfigError> {
-        let overrides: Vec<String> = overrides.iter().map(|&text| text.to_owned()).collect();
-        parse_config(Path::new("tiny.toml"), file, &overrides, |_| Ok(()))
-    }
-
     #[cfg(unix)]
     #[test]
     fn devices_are_not_configs() {
@@ -133,7 +128,9 @@ mod tests {
 
     #[test]
     fn every_mistake_is_listed_in_its_text() {
-        let message = parse(FILE, &["device=wgpu", "stage2.step=3"]).unwrap_err().to_string();
+        let overrides = ["device=wgpu", "stage2.step=3"].map(str::to_owned);
+        let parsed = parse_config::<Config>(Path::new("tiny.toml"), FILE, &overrides, |_| Ok(()));
+        let message = parsed.unwrap_err().to_string();
         let titles: Vec<&str> = message.split("\n\n").filter_map(|part| part.split("\n  |").next()).collect();
         assert_eq!(
             titles,
