@@ -55,19 +55,17 @@ pub(crate) fn contact_sheet(clip: &Clip, results: &SceneResults) -> Result<Canva
         sheet.write_text(&frame, MARGIN_PX, head + row_height * row, &SMALL, FAINT);
         let target = view_image(&clip.target, view);
         sheet.paste(&contexts, column_x(0), y);
-        let mut paste = |column: usize, image: Canvas| {
-            sheet.paste(&image.fitted(cell_width, cell_height), column_x(column), y);
-        };
-        paste(1, Canvas::from_unit(&target, height, width)?);
+        let fitted = |image: Canvas| image.fitted(cell_width, cell_height);
+        sheet.paste(&fitted(Canvas::from_unit(&target, height, width)?), column_x(1), y);
         for (i, rendering) in shown.iter().enumerate() {
-            paste(2 + i, Canvas::from_unit(&rendering.images[&view], height, width)?);
-        }
-        if let Some(last) = shown.last() {
-            paste(titles.len() - 1, error_map(&last.images[&view], &target, height, width)?);
-        }
-        for (i, rendering) in shown.iter().enumerate() {
+            let image = Canvas::from_unit(&rendering.images[&view], height, width)?;
+            sheet.paste(&fitted(image), column_x(2 + i), y);
             let psnr = format!("{:.2} dB", rendering.metrics[&view].psnr);
             sheet.write_text(&psnr, column_x(2 + i), y + cell_height + 4, &SMALL, INK);
+        }
+        if let Some(last) = shown.last() {
+            let errors = error_map(&last.images[&view], &target, height, width)?;
+            sheet.paste(&fitted(errors), column_x(titles.len() - 1), y);
         }
     }
     let scale = format!("error: mean over red, green and blue, black 0 to white {ERROR_FULL_SCALE}");
