@@ -39,7 +39,11 @@ impl Counter {
     }
 
     pub fn set(&mut self, done: u64) {
-        let line = || line(&self.name, done, self.total, self.started.elapsed().as_secs_f64());
+        let line = || {
+            let per_s = done.max(1) as f64 / self.started.elapsed().as_secs_f64().max(1e-9);
+            let left_s = self.total.saturating_sub(done) as f64 / per_s;
+            format!("{} {done}/{}  {}, {} left", self.name, self.total, rate(per_s), duration(left_s))
+        };
         match &self.bar {
             Some(bar) => {
                 bar.set_message(line());
@@ -74,10 +78,4 @@ pub fn scan_counter() -> impl FnMut(usize, usize) {
             scan = None;
         }
     }
-}
-
-fn line(name: &str, done: u64, total: u64, elapsed_s: f64) -> String {
-    let per_s = done.max(1) as f64 / elapsed_s.max(1e-9);
-    let left_s = total.saturating_sub(done) as f64 / per_s;
-    format!("{name} {done}/{total}  {}, {} left", rate(per_s), duration(left_s))
 }
