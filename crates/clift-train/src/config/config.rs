@@ -64,12 +64,10 @@ impl Config {
 
     /// Returns the steps of a run in their order.
     pub fn run_steps(&self) -> &'static [RunStep] {
-        const STAGE_1: RunStep = RunStep::Train(Stage::Stage1);
-        const STAGE_2: RunStep = RunStep::Train(Stage::Stage2);
         if self.model.architecture.supports_clusters() {
-            &[STAGE_1, RunStep::Clusters, STAGE_2, RunStep::Eval]
+            &[RunStep::Train(Stage::Stage1), RunStep::Clusters, RunStep::Train(Stage::Stage2), RunStep::Eval]
         } else {
-            &[STAGE_1, RunStep::Eval]
+            &[RunStep::Train(Stage::Stage1), RunStep::Eval]
         }
     }
 
