@@ -28,8 +28,7 @@ pub fn progress_sink() -> Box<dyn Sink> {
         }
         Verbosity::Normal => {}
     }
-    let mut lines = ProgressLines::new(stderr(), if has_bar() { 0.0 } else { INTERVAL_S });
-    lines.has_bar = has_bar();
+    let mut lines = ProgressLines::new(stderr(), has_bar());
     let mut scan = scan_counter();
     Box::new(move |event: &Event| match event {
         Event::Scan { done, total } => scan(*done, *total),
@@ -37,7 +36,7 @@ pub fn progress_sink() -> Box<dyn Sink> {
     })
 }
 
-/// Events at once; steps every `interval_s` seconds of training, and the first and the last one, or beside a bar.
+/// Events at once; steps every ten seconds of training, and the first and the last one; beside a bar all.
 struct ProgressLines<W> {
     out: W,
     has_bar: bool,
@@ -47,13 +46,11 @@ struct ProgressLines<W> {
     /// Steps since the stage started or resumed, and the seconds of all but the first, which may compile kernels.
     pace: (u64, f64),
     printed_tenth: u64,
-    /// Seconds of training between two lines.
-    interval_s: f64,
 }
 
 impl<W: Write> ProgressLines<W> {
-    fn new(out: W, interval_s: f64) -> Self {
-        Self { out, has_bar: false, bar: None, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0, interval_s }
+    fn new(out: W, has_bar: bool) -> Self {
+        Self { out, has_bar, bar: None, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0 }
     }
 
     fn event(&mut self, event: &Event) {
@@ -96,7 +93,8 @@ impl<W: Write> ProgressLines<W> {
             self.pace.1 += event.step_s;
         }
         self.since_line_s += event.step_s;
-        let is_due = self.pace.0 == 1 || event.step == event.last_step || self.since_line_s >= self.interval_s;
+        let is_end = self.pace.0 == 1 || event.step == event.last_step;
+        let is_due = is_end || self.has_bar || self.since_line_s >= INTERVAL_S;
         if !is_due {
             return None;
         }
@@ -166,7 +164,7 @@ mod tests {
     }
 
     fn printed(events: &[Event]) -> String {
-        let mut lines = ProgressLines::new(Vec::new(), INTERVAL_S);
+        let mut lines = ProgressLines::new(Vec::new(), false);
         for event in events {
             lines.event(event);
         }
@@ -191,8 +189,7 @@ stage1: done in 25 s
 
     #[test]
     fn a_bar_follows_the_steps_of_a_stage() {
-        let mut lines = ProgressLines::new(Vec::new(), 0.0);
-        lines.has_bar = true;
+        let mut lines = ProgressLines::new(Vec::new(), true);
         lines.event(&Event::StepStarted { run_step: Stage::Stage1.into(), done: 40, num_steps: 100 });
         let first = StepEvent { step_s: 12.34, last_step: 90_000, ..step(12_345) };
         lines.event(&Event::Step(first));
