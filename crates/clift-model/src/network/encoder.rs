@@ -1,4 +1,5 @@
 //! The multi-view encoder: context views to tokens (paper section 3.1).
+// B scenes, V views, H rows, W columns
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -6,13 +7,15 @@ use burn::tensor::Tensor;
 
 use crate::network::architecture::Architecture;
 use crate::network::blocks::block::EncoderBlock;
-use crate::network::blocks::pixels::embed_context;
 use crate::network::camera_encoding::transforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
-use crate::network::lvsm_ed::Latents;
+use crate::network::lvsm_ed::{Latents, forward_blocks};
 use crate::network::tokens::Tokens;
-use crate::views::upload::{Cameras, Views};
+use crate::ops::linear::linear_in_f32;
+use crate::views::patch::patchify;
+use crate::views::rays::rays;
+use crate::views::upload::Views;
 
 /// Patch embedding and self-attention over the tokens of all views, as a list of blocks on the residual stream. Its result
 /// has no norm; one variant applies a norm to it.
@@ -42,38 +45,16 @@ impl Encoder {
     /// # Shapes
     /// - returns `[batch, num_tokens, dim]`; tokens of patches are ordered by view, row, column
     pub fn forward(&self, context: &Views) -> Tokens {
-        let transforms = self.transforms(&context.cameras);
-        let forward = |x, index| self.block(index, x, transforms.as_ref());
-        let values = (0..self.num_blocks()).fold(self.embed(context), forward);
-        Tokens { values, transforms }
-    }
-
-    /// Makes the transforms of the tokens for camera-relative attention; `None` without it.
-    pub(crate) fn transforms(&self, context: &Cameras) -> Option<Tensor<3>> {
-        transforms(&self.config, context)
-    }
-
-    /// Makes the input of the first block, `[batch, rows, dim]`.
-    pub(crate) fn embed(&self, context: &Views) -> Tensor<3> {
-        let ModelConfig { patch_size, rays, .. } = self.config;
+        let ModelConfig { patch_size, rays: frame, num_latents, .. } = self.config;
+        let transforms = transforms(&self.config, &context.cameras);
         let colors = context.images.clone();
         let colors = if self.latents.is_some() { colors * 2.0 - 1.0 } else { colors };
-        let x = embed_context(&self.patch_embed, colors, &context.cameras, patch_size, rays);
-        match &self.latents {
-            Some(latents) => latents.join(x),
-            None => x,
-        }
-    }
-
-    pub(crate) fn num_blocks(&self) -> usize {
-        self.blocks.len()
-    }
-
-    /// Applies a block; the last one returns the tokens, `[batch, num_tokens, dim]`.
-    pub(crate) fn block(&self, index: usize, x: Tensor<3>, transforms: Option<&Tensor<3>>) -> Tensor<3> {
-        if self.latents.is_some() && index + 1 == self.blocks.len() {
-            return self.blocks[index].forward_first(x, self.config.num_latents);
-        }
-        self.blocks[index].forward(x, transforms)
+        let pixels = Tensor::cat(vec![colors, rays(&context.cameras, frame)], 4); // [B, V, H, W, 6 or 9]
+        let x = linear_in_f32(&self.patch_embed, patchify(pixels, patch_size));
+        let values = match &self.latents {
+            Some(latents) => forward_blocks(&self.blocks, latents.join(x), num_latents),
+            None => self.blocks.iter().fold(x, |x, block| block.forward(x, transforms.as_ref())),
+        };
+        Tokens { values, transforms }
     }
 }

@@ -43,33 +43,23 @@ impl JointDecoder {
         }
     }
 
-    pub(crate) fn num_blocks(&self) -> usize {
-        self.blocks.len()
-    }
-
-    /// Joins the patches of every view with the latents of its scene: the input of the first block.
+    /// Joins the patches of every view with the latents of its scene, and applies norm and blocks.
     ///
     /// # Shapes
-    /// - `patches`: `[batch * views, num_queries, dim]`
+    /// - `patches` and the result: `[batch * views, num_queries, dim]`
     /// - `latents`: `[batch, num_latents, dim]`, or one set per view
-    /// - returns `[batch * views, num_queries + num_latents, dim]`
-    pub(crate) fn join(&self, patches: Tensor<3>, latents: Tensor<3>) -> Tensor<3> {
-        let ([views, ..], [groups, count, dim]) = (patches.dims(), latents.dims());
+    pub(crate) fn forward(&self, patches: Tensor<3>, latents: Tensor<3>) -> Tensor<3> {
+        let ([views, num_queries, _], [groups, count, dim]) = (patches.dims(), latents.dims());
         let of_views = latents.unsqueeze_dim::<4>(1).expand([groups, views / groups, count, dim]);
-        self.input_norm.forward(Tensor::cat(vec![patches, of_views.reshape([views, count, dim])], 1))
+        let joined = Tensor::cat(vec![patches, of_views.reshape([views, count, dim])], 1);
+        forward_blocks(&self.blocks, self.input_norm.forward(joined), num_queries)
     }
+}
 
-    /// Applies a block. The last one returns the patches alone.
-    ///
-    /// # Shapes
-    /// - `x`: `[batch * views, num_queries + num_latents, dim]`
-    /// - returns the same, or `[batch * views, num_queries, dim]` from the last block
-    pub(crate) fn block(&self, block: usize, x: Tensor<3>, num_latents: usize) -> Tensor<3> {
-        let [_, rows, _] = x.dims();
-        if block + 1 == self.blocks.len() {
-            self.blocks[block].forward_first(x, rows - num_latents)
-        } else {
-            self.blocks[block].forward(x, None)
-        }
-    }
+/// Applies blocks to `x: [batch, rows, dim]`; the last one returns the first `count` rows: nothing reads the others.
+pub(crate) fn forward_blocks(blocks: &[EncoderBlock], x: Tensor<3>, count: usize) -> Tensor<3> {
+    blocks.iter().enumerate().fold(x, |x, (index, block)| {
+        let is_last = index + 1 == blocks.len();
+        if is_last { block.forward_first(x, count) } else { block.forward(x, None) }
+    })
 }

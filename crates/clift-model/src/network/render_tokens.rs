@@ -16,14 +16,6 @@ pub enum KeyValueCache {
 }
 
 impl KeyValueCache {
-    /// Returns the number of tokens of every set.
-    pub fn num_tokens(&self) -> usize {
-        match self {
-            Self::Tokens(tokens) => tokens.num_tokens(),
-            Self::Projected(blocks) => blocks[0].dims()[1],
-        }
-    }
-
     /// Returns the tokens of every set, `[groups, num_tokens, dim]`.
     pub(crate) fn sets(&self) -> Tensor<3> {
         match self {
@@ -76,18 +68,14 @@ impl RenderTokens {
             .map(|(scene, token)| (scene * num_tokens) as i64 + i64::from(token))
             .collect();
         let count = rows.len();
-        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &tokens.values.device());
-        let rows = rows.reshape([groups, count / groups]);
+        let rows = TensorData::new(rows, [groups, count / groups]);
+        let rows = Tensor::<2, Int>::from_data(rows, &tokens.values.device());
         // Keys and values are projected from whichever has fewer rows: the tokens, or all subsets together.
         if count < batch * num_tokens {
-            tokens.map(|x| gather(x, rows.clone())).into()
+            tokens.map(|x| gather(x, Some(&rows))).into()
         } else {
             Self { tokens, rows: Some(rows) }
         }
-    }
-
-    pub(crate) fn num_tokens(&self) -> usize {
-        self.rows.as_ref().map_or(self.tokens.dims()[1], |rows| rows.dims()[1])
     }
 
     /// Returns the values of the tokens that keys and values are projected from.
@@ -101,24 +89,18 @@ impl RenderTokens {
 
     /// Returns the tokens of every set, `[groups, num_render_tokens, dim]`.
     pub(crate) fn sets(&self) -> Tensor<3> {
-        match &self.rows {
-            Some(rows) => gather(self.tokens.values.clone(), rows.clone()),
-            None => self.tokens.values.clone(),
-        }
+        gather(self.tokens.values.clone(), self.rows.as_ref())
     }
 
     /// Projects the keys and values of every set for a block, `[groups, num_render_tokens, 2 dim]`.
     pub fn project(&self, block: &DecoderBlock) -> Tensor<3> {
-        let key_value = block.project_tokens(self.tokens.clone());
-        match &self.rows {
-            Some(rows) => gather(key_value, rows.clone()),
-            None => key_value,
-        }
+        gather(block.project_tokens(self.tokens.clone()), self.rows.as_ref())
     }
 }
 
-/// `[B, N, D]`, rows `[G, R]` of `[BN, D] -> [G, R, D]`
-fn gather(x: Tensor<3>, rows: Tensor<2, Int>) -> Tensor<3> {
+/// `[B, N, D]`, rows `[G, R]` of `[BN, D] -> [G, R, D]`; all of `[B, N, D]` without rows
+fn gather(x: Tensor<3>, rows: Option<&Tensor<2, Int>>) -> Tensor<3> {
+    let Some(rows) = rows else { return x };
     let ([batch, count, dim], [groups, kept]) = (x.dims(), rows.dims());
-    x.reshape([batch * count, dim]).select(0, rows.reshape([groups * kept])).reshape([groups, kept, dim])
+    x.reshape([batch * count, dim]).select(0, rows.clone().reshape([groups * kept])).reshape([groups, kept, dim])
 }

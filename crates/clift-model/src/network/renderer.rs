@@ -1,18 +1,22 @@
 //! The renderer: ray patches of a target view read the tokens (paper section 3.3).
+// B scenes, T target views, Q patches of a view, D width
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
+use burn::tensor::activation::sigmoid;
 
 use crate::network::architecture::{Architecture, CameraEncoding};
 use crate::network::blocks::block::DecoderBlock;
-use crate::network::blocks::pixels::{decode_image, embed_rays};
 use crate::network::camera_encoding::transforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::lvsm_ed::JointDecoder;
 use crate::network::render_tokens::{KeyValueCache, RenderTokens};
+use crate::ops::linear::{linear_in_f32, norm_linear};
+use crate::views::patch::{patchify, unpatchify};
 use crate::views::patch_grids::PatchGrids;
+use crate::views::rays::rays;
 use crate::views::upload::Cameras;
 
 /// A transformer decoder whose queries are the ray patches of a target view, as a list of blocks on the residual stream of
@@ -95,14 +99,35 @@ impl Renderer {
     }
 
     fn forward_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
-        let transforms = self.transforms(targets);
-        let forward = |x, index| self.block(index, x, cache, transforms.as_ref());
-        self.to_image((0..self.num_blocks()).fold(self.embed(cache, targets), forward), targets)
+        let ModelConfig { patch_size, rays: frame, .. } = self.config;
+        let [batch, views] = targets.dims();
+        // Views are sequences of their own: [B, TQ, D] -> [BT, Q, D]
+        let of_views = |x: Tensor<3>| {
+            let [_, count, width] = x.dims();
+            x.reshape([batch * views, count / views, width])
+        };
+        let x = of_views(linear_in_f32(&self.ray_embed, patchify(rays(targets, frame), patch_size)));
+        let x = if let Some(joint) = &self.joint {
+            joint.forward(x, cache.sets())
+        } else {
+            let transforms = transforms(&self.config, targets).map(of_views);
+            self.blocks.iter().enumerate().fold(x, |x, (index, block)| {
+                let key_value = match cache {
+                    KeyValueCache::Tokens(tokens) => tokens.project(block),
+                    KeyValueCache::Projected(blocks) => blocks[index].clone(),
+                };
+                block.forward(x, key_value, transforms.as_ref())
+            })
+        };
+        let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x));
+        let [_, num_queries, values] = patches.dims();
+        let patches = patches.reshape([batch, views * num_queries, values]);
+        unpatchify(patches, [views, targets.height, targets.width], patch_size)
     }
 
     /// Checks that tokens and target patches both have transforms, or neither: queries alone in the frame of their camera
     /// would give a wrong image.
-    pub(crate) fn accept(&self, tokens: RenderTokens) -> RenderTokens {
+    fn accept(&self, tokens: RenderTokens) -> RenderTokens {
         assert_eq!(
             tokens.has_transforms(),
             self.config.camera_encoding != CameraEncoding::Plucker,
@@ -110,51 +135,6 @@ impl Renderer {
              network encoded, or render a scene with `SceneRenderer`"
         );
         tokens
-    }
-
-    /// Makes the transforms of target patches, one sequence per view; `None` without camera-relative attention.
-    pub(crate) fn transforms(&self, targets: &Cameras) -> Option<Tensor<3>> {
-        let [batch, views] = targets.dims();
-        transforms(&self.config, targets).map(|transforms| {
-            let [_, count, len] = transforms.dims();
-            transforms.reshape([batch * views, count / views, len])
-        })
-    }
-
-    pub(crate) fn embed(&self, tokens: &KeyValueCache, targets: &Cameras) -> Tensor<3> {
-        let x = embed_rays(&self.ray_embed, targets, self.config.patch_size, self.config.rays);
-        match &self.joint {
-            Some(joint) => joint.join(x, tokens.sets()),
-            None => x,
-        }
-    }
-
-    pub(crate) fn num_blocks(&self) -> usize {
-        self.joint.as_ref().map_or(self.blocks.len(), JointDecoder::num_blocks)
-    }
-
-    /// Applies a block; the last one returns `[batch * views, num_queries, dim]`.
-    pub(crate) fn block(
-        &self,
-        index: usize,
-        x: Tensor<3>,
-        tokens: &KeyValueCache,
-        transforms: Option<&Tensor<3>>,
-    ) -> Tensor<3> {
-        if let Some(joint) = &self.joint {
-            return joint.block(index, x, tokens.num_tokens());
-        }
-        let block = &self.blocks[index];
-        let key_value = match tokens {
-            KeyValueCache::Tokens(tokens) => tokens.project(block),
-            KeyValueCache::Projected(blocks) => blocks[index].clone(),
-        };
-        block.forward(x, key_value, transforms)
-    }
-
-    /// Decodes the output of the last block into RGB in `(0, 1)`, `[batch, views, height, width, 3]`.
-    pub(crate) fn to_image(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
-        decode_image(&self.output_norm, &self.to_pixels, x, targets, self.config.patch_size)
     }
 }
 
