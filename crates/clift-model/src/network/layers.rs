@@ -58,41 +58,20 @@ pub type Sequence = &'static [Rows];
 /// Operation of a layer with its width: of all heads together, except in [`LayerKind::HeadNorm`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LayerKind {
-    Linear {
-        inputs: usize,
-        outputs: usize,
-        bias: bool,
-    },
-    LayerNorm {
-        width: usize,
-        bias: bool,
-    },
+    /// Product with a matrix; a vector is added with `bias`.
+    Linear { inputs: usize, outputs: usize, bias: bool },
+    /// Layer norm of every row; a vector is added with `bias`.
+    LayerNorm { width: usize, bias: bool },
     /// RMS norm of every head of queries or keys; the heads share one scale.
-    HeadNorm {
-        width: usize,
-        heads: usize,
-    },
+    HeadNorm { width: usize, heads: usize },
     /// Softmax attention of every row to all keys of its group.
-    Attention {
-        width: usize,
-        heads: usize,
-        keys: Sequence,
-    },
+    Attention { width: usize, heads: usize, keys: Sequence },
     /// Softmax attention of every centroid to the keys of its cluster; each key belongs to one centroid.
-    ClusterAttention {
-        width: usize,
-        keys: Sequence,
-    },
+    ClusterAttention { width: usize, keys: Sequence },
     /// Activation between the layers of a feed-forward network.
-    Activation {
-        width: usize,
-        activation: Activation,
-    },
+    Activation { width: usize, activation: Activation },
     /// Learned rows, beside the layer's input.
-    Table {
-        rows: usize,
-        width: usize,
-    },
+    Table { rows: usize, width: usize },
 }
 
 impl Layer {
