@@ -222,10 +222,8 @@ impl ModelConfig {
         check_count("model.num_renderer_blocks", self.num_renderer_blocks, 1 << 10)?;
         check_count("model.patch_size", self.patch_size, 256)?;
         let Self { dim, num_heads, .. } = *self;
-        if !dim.is_multiple_of(num_heads) {
-            let fix = format!("write a divisor of model.dim = {dim}, such as {}", near_divisors(dim, num_heads));
-            return bad("model.num_heads", num_heads, fix);
-        }
+        let fix = format!("write a divisor of model.dim = {dim}, such as {}", near_divisors(dim, num_heads));
+        check(dim.is_multiple_of(num_heads), "model.num_heads", num_heads, fix)?;
         check_count("model.num_encoder_blocks", self.num_encoder_blocks, 1 << 10)?;
         match self.architecture {
             Architecture::Clift => self.validate_clift()?,
@@ -235,77 +233,61 @@ impl ModelConfig {
     }
 
     fn validate_clift(&self) -> Result<(), ModelError> {
-        let variant = self.variant;
+        let CondenserConfig { num_blocks, residual, member_share } = self.condenser;
         self.check_absent("model.num_latents", self.num_latents)?;
-        check_count("model.condenser.num_blocks", self.condenser.num_blocks, 64)?;
-        if !variant.is_released() {
+        check_count("model.condenser.num_blocks", num_blocks, 64)?;
+        if !self.variant.is_released() {
             return Ok(());
         }
-        let CondenserConfig { num_blocks, residual, member_share } = self.condenser;
-        if self.camera_encoding != CameraEncoding::Plucker {
-            let fix = format!("model.variant = \"{variant}\" has \"plucker\": leave the key out");
-            return bad("model.camera_encoding", self.camera_encoding, fix);
-        }
-        if num_blocks != 1 {
-            let fix = format!("model.variant = \"{variant}\" has one: leave the key out");
-            return bad("model.condenser.num_blocks", num_blocks, fix);
-        }
-        if !residual {
-            let fix = format!("the block of model.variant = \"{variant}\" has residuals: leave the key out");
-            return bad("model.condenser.residual", residual, fix);
-        }
-        if member_share {
-            let fix = format!("the block of model.variant = \"{variant}\" adds the whole update: leave the key out");
-            return bad("model.condenser.member_share", member_share, fix);
-        }
-        Ok(())
+        let name = format!("model.variant = \"{}\"", self.variant);
+        let fix = format!("{name} has \"plucker\": leave the key out");
+        check(!self.is_camera_relative(), "model.camera_encoding", self.camera_encoding, fix)?;
+        let fix = format!("{name} has one: leave the key out");
+        check(num_blocks == 1, "model.condenser.num_blocks", num_blocks, fix)?;
+        let fix = format!("the block of {name} has residuals: leave the key out");
+        check(residual, "model.condenser.residual", residual, fix)?;
+        let fix = format!("the block of {name} adds the whole update: leave the key out");
+        check(!member_share, "model.condenser.member_share", member_share, fix)
     }
 
     fn validate_lvsm_ed(&self) -> Result<(), ModelError> {
         check_count("model.num_latents", self.num_latents, 1 << 16)?;
         self.check_absent("model.condenser.num_blocks", self.condenser.num_blocks)?;
         let own = |value| format!("model.architecture = \"{}\" has \"{value}\": leave the key out", self.architecture);
-        if self.camera_encoding != CameraEncoding::Plucker {
-            return bad("model.camera_encoding", self.camera_encoding, own("plucker"));
-        }
-        if self.variant == CliftVariant::Paper { Ok(()) } else { bad("model.variant", self.variant, own("paper")) }
+        check(!self.is_camera_relative(), "model.camera_encoding", self.camera_encoding, own("plucker"))?;
+        check(self.variant == CliftVariant::Paper, "model.variant", self.variant, own("paper"))
     }
 
     /// Checks that a count of what the architecture lacks is 0.
     fn check_absent(&self, key: &'static str, value: usize) -> Result<(), ModelError> {
-        let fix = || format!("model.architecture = \"{}\" has none: leave the key out", self.architecture);
-        if value > 0 { bad(key, value, fix()) } else { Ok(()) }
+        let fix = format!("model.architecture = \"{}\" has none: leave the key out", self.architecture);
+        check(value == 0, key, value, fix)
     }
 
     fn validate_cameras(&self) -> Result<(), ModelError> {
-        let head_width = self.dim / self.num_heads;
-        if self.camera_encoding != CameraEncoding::Plucker && !head_width.is_multiple_of(8) {
-            let fix = format!("needs heads of a multiple of 8 channels, not {head_width}: change model.num_heads");
-            return bad("model.camera_encoding", self.camera_encoding, fix);
-        }
-        if self.rays == RayFrame::Camera && self.camera_encoding == CameraEncoding::Plucker {
-            let fix = "needs camera-relative attention: write model.camera_encoding = \"gta\"".into();
-            return bad("model.rays", self.rays, fix);
-        }
-        if self.patch_grids != PatchGrids::One && self.patch_size == 1 {
-            let fix = "patches of one pixel have no halves: write 1".into();
-            return bad("model.patch_grids", usize::from(self.patch_grids), fix);
-        }
-        Ok(())
+        let (is_relative, head_width) = (self.is_camera_relative(), self.dim / self.num_heads);
+        let fix = format!("needs heads of a multiple of 8 channels, not {head_width}: change model.num_heads");
+        check(!is_relative || head_width.is_multiple_of(8), "model.camera_encoding", self.camera_encoding, fix)?;
+        let fix = "needs camera-relative attention: write model.camera_encoding = \"gta\"".into();
+        check(is_relative || self.rays != RayFrame::Camera, "model.rays", self.rays, fix)?;
+        let has_halves = self.patch_size > 1 || self.patch_grids == PatchGrids::One;
+        let fix = "patches of one pixel have no halves: write 1".into();
+        check(has_halves, "model.patch_grids", usize::from(self.patch_grids), fix)
+    }
+
+    fn is_camera_relative(&self) -> bool {
+        self.camera_encoding != CameraEncoding::Plucker
     }
 }
 
-fn bad(key: &'static str, value: impl Display, fix: String) -> Result<(), ModelError> {
-    Err(ModelError::BadConfig { key, value: value.to_string(), fix })
+fn check(is_right: bool, key: &'static str, value: impl Display, fix: String) -> Result<(), ModelError> {
+    if is_right { Ok(()) } else { Err(ModelError::BadConfig { key, value: value.to_string(), fix }) }
 }
 
 /// Checks that a count is at least 1 and at most `most`.
 fn check_count(key: &'static str, value: usize, most: usize) -> Result<(), ModelError> {
-    match value {
-        0 => bad(key, value, "write at least 1".into()),
-        _ if value > most => bad(key, value, format!("write at most {most}")),
-        _ => Ok(()),
-    }
+    check(value > 0, key, value, "write at least 1".into())?;
+    check(value <= most, key, value, format!("write at most {most}"))
 }
 
 /// Returns the divisors of `number` next to `wrong` as text.
