@@ -41,12 +41,8 @@ impl VggShape {
     pub const VGG16: Self =
         Self { widths: [64, 128, 256, 512, 512], convs: [2, 2, 3, 3, 3], taps: [2, 2, 3, 3, 3], pooling: Pooling::Max };
     /// VGG-19 with average pooling and the features `relu1_2`, `relu2_2`, `relu3_2`, `relu4_2` and `relu5_2`.
-    pub const VGG19: Self = Self {
-        widths: [64, 128, 256, 512, 512],
-        convs: [2, 2, 4, 4, 2],
-        taps: [2, 2, 2, 2, 2],
-        pooling: Pooling::Average,
-    };
+    pub const VGG19: Self =
+        Self { convs: [2, 2, 4, 4, 2], taps: [2, 2, 2, 2, 2], pooling: Pooling::Average, ..Self::VGG16 };
 }
 
 /// Cost of a network for one image, in f32 values and multiply-accumulates.

@@ -102,7 +102,7 @@ impl CondenserBlock {
             norm_memory: (!is_released).then(|| init.layer_norm(dim)),
             cluster_attn: CrossAttention::new(config, init),
             norm_ff: init.layer_norm(dim),
-            feed_forward: FeedForward::with(activation, dim, config.feed_forward_dim, init),
+            feed_forward: FeedForward::new(activation, dim, config.feed_forward_dim, init),
             gate: init.zero_linear(dim, is_released),
             member_share: config.condenser.member_share,
         }

@@ -6,7 +6,7 @@ use burn::nn::LayerNorm;
 use burn::tensor::Tensor;
 
 use crate::network::blocks::attention::{CrossAttention, SelfAttention};
-use crate::network::blocks::feed_forward::FeedForward;
+use crate::network::blocks::feed_forward::{Activation, FeedForward};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::tokens::Tokens;
@@ -27,7 +27,7 @@ impl EncoderBlock {
             norm_attn: init.layer_norm(config.dim),
             attn: SelfAttention::new(config, init),
             norm_ff: init.layer_norm(config.dim),
-            feed_forward: FeedForward::new(config.dim, config.feed_forward_dim, init),
+            feed_forward: FeedForward::new(Activation::Gelu, config.dim, config.feed_forward_dim, init),
         }
     }
 
@@ -68,7 +68,7 @@ impl DecoderBlock {
             norm_cross: init.layer_norm(config.dim),
             cross_attn: CrossAttention::new(config, init),
             norm_ff: init.layer_norm(config.dim),
-            feed_forward: FeedForward::new(config.dim, config.feed_forward_dim, init),
+            feed_forward: FeedForward::new(Activation::Gelu, config.dim, config.feed_forward_dim, init),
         }
     }
 

@@ -24,12 +24,8 @@ pub struct FeedForward {
 }
 
 impl FeedForward {
-    /// Makes a network with GELU and PyTorch's initialization.
-    pub fn new(dim: usize, hidden: usize, init: &mut Init) -> Self {
-        Self::with(Activation::Gelu, dim, hidden, init)
-    }
-
-    pub fn with(activation: Activation, dim: usize, hidden: usize, init: &mut Init) -> Self {
+    /// Makes a network with PyTorch's initialization.
+    pub fn new(activation: Activation, dim: usize, hidden: usize, init: &mut Init) -> Self {
         Self { up: init.linear(dim, hidden), down: init.linear(hidden, dim), activation }
     }
 
