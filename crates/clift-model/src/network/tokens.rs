@@ -72,8 +72,7 @@ impl Tokens {
 /// Selects the same rows of every scene, given by their indices.
 pub(crate) fn select(rows: Tensor<3>, ids: &[u32]) -> Tensor<3> {
     let ids: Vec<i64> = ids.iter().map(|&id| i64::from(id)).collect();
-    let count = ids.len();
-    let ids = Tensor::<1, Int>::from_data(TensorData::new(ids, [count]), &rows.device());
+    let ids = Tensor::<1, Int>::from_data(ids.as_slice(), &rows.device());
     rows.select(1, ids)
 }
 

@@ -83,29 +83,22 @@ impl Clusters {
         let batch = self.scenes.len();
         let num_tokens = self.scenes[0].assignment.len();
         let num_storage_tokens = self.scenes[0].centroid_index.len();
-        let num_members = num_tokens - num_storage_tokens;
-        let mut centroid = Vec::with_capacity(batch * num_storage_tokens);
-        let mut member = Vec::with_capacity(batch * num_members);
-        let mut segment = Vec::with_capacity(batch * num_members);
-        let mut all_segments = Vec::with_capacity(batch * num_tokens);
+        let (mut centroid, mut all_segments) = (Vec::new(), Vec::new());
+        let (mut member, mut segment) = (Vec::new(), Vec::new());
         let mut num_members_of = vec![0_u32; batch * num_storage_tokens];
         for (scene, clusters) in self.scenes.iter().enumerate() {
-            centroid
-                .extend(clusters.centroid_index.iter().map(|&token| (scene * num_tokens) as i64 + i64::from(token)));
+            centroid.extend(clusters.centroid_index.iter().map(|&token| (scene * num_tokens + token as usize) as i64));
             for (token, &cluster) in clusters.assignment.iter().enumerate() {
-                all_segments.push((scene * num_storage_tokens) as i64 + i64::from(cluster));
+                let row = scene * num_storage_tokens + cluster as usize;
+                all_segments.push(row as i64);
                 if clusters.centroid_index[cluster as usize] as usize != token {
-                    let row = scene * num_storage_tokens + cluster as usize;
                     member.push((scene * num_tokens + token) as i64);
                     segment.push(row as i64);
                     num_members_of[row] += 1;
                 }
             }
         }
-        let index = |values: Vec<i64>| {
-            let count = values.len();
-            Tensor::<1, Int>::from_data(TensorData::new(values, [count]), device)
-        };
+        let index = |rows: Vec<i64>| Tensor::<1, Int>::from_data(rows.as_slice(), device);
         let per_cluster = [batch, num_storage_tokens, 1];
         let singleton: Vec<bool> = num_members_of.iter().map(|&count| count == 0).collect();
         let member_share: Vec<f32> = num_members_of.iter().map(|&count| count as f32 / (count + 1) as f32).collect();
@@ -114,7 +107,7 @@ impl Clusters {
             num_tokens,
             centroid: index(centroid),
             segment: index(all_segments),
-            members: (num_members > 0).then(|| Members { token: index(member), segment: index(segment) }),
+            members: (!member.is_empty()).then(|| Members { token: index(member), segment: index(segment) }),
             singleton: singleton
                 .contains(&true)
                 .then(|| Tensor::<3, Bool>::from_data(TensorData::new(singleton, per_cluster), device)),

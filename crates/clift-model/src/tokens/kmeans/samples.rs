@@ -1,6 +1,6 @@
 //! The tokens of one scene: distances and means, on the device.
 
-use burn::tensor::{DType, Device, IndexingUpdateOp, Int, Tensor, TensorData, Transaction};
+use burn::tensor::{DType, IndexingUpdateOp, Tensor, TensorData, Transaction};
 use rayon::prelude::*;
 
 use crate::ops::matmul::matmul_without_gradient;
@@ -29,19 +29,9 @@ impl Samples {
         self.squares.len()
     }
 
-    fn device(&self) -> Device {
-        self.tokens.device()
-    }
-
     /// Selects tokens, `[ids.len(), D]`.
     pub fn select(&self, ids: &[usize]) -> Tensor<2> {
-        let ids: Vec<i64> = ids.iter().map(|&id| id as i64).collect();
-        self.tokens.clone().select(0, self.index(ids))
-    }
-
-    fn index(&self, ids: Vec<i64>) -> Tensor<1, Int> {
-        let count = ids.len();
-        Tensor::from_data(TensorData::new(ids, [count]), &self.device())
+        self.tokens.clone().select(0, Tensor::from_data(ids, &self.tokens.device()))
     }
 
     /// Computes the squared distances `|x|^2 - 2 x y + |y|^2` of some tokens to all, on the host: `[ids.len(), N]`.
@@ -83,9 +73,10 @@ impl Samples {
     pub fn means(&self, labels: &Labels, num_clusters: usize) -> Tensor<2> {
         let mut counts = vec![0.0_f64; num_clusters];
         labels.assignment.iter().for_each(|&cluster| counts[cluster as usize] += 1.0);
-        let like = (&self.device(), self.tokens.dtype());
+        let like = (&self.tokens.device(), self.tokens.dtype());
         let counts = Tensor::<2>::from_data(TensorData::new(counts, [num_clusters, 1]), like);
-        let rows = self.index(labels.assignment.iter().map(|&cluster| i64::from(cluster)).collect());
+        let rows: Vec<i64> = labels.assignment.iter().map(|&cluster| i64::from(cluster)).collect();
+        let rows = Tensor::from_data(rows.as_slice(), like.0);
         let sums = Tensor::<2>::zeros([num_clusters, self.tokens.dims()[1]], like);
         sums.select_assign(0, rows, self.tokens.clone(), IndexingUpdateOp::Add) / counts
     }
