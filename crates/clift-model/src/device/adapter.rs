@@ -29,19 +29,13 @@ pub struct Adapter {
 }
 
 /// Returns the most bytes of one tensor on an open device; `None` if memory is the only limit.
-#[cfg(feature = "wgpu")]
 pub fn max_tensor_bytes(device: &Device) -> Option<u64> {
     match device.clone().without_autodiff().as_dispatch() {
         // The smaller of both limits of the adapter; the allocator refuses larger buffers.
+        #[cfg(feature = "wgpu")]
         burn::backend::DispatchDevice::Cube(device) => Some(device.client().properties().memory.max_page_size),
         _ => None,
     }
-}
-
-/// Returns the most bytes of one tensor on an open device; `None` if memory is the only limit.
-#[cfg(not(feature = "wgpu"))]
-pub fn max_tensor_bytes(_device: &Device) -> Option<u64> {
-    None
 }
 
 /// Says by which instructions an open GPU multiplies matrices in f32 and f16; `None` for a CPU.

@@ -47,17 +47,12 @@ pub fn observe_kernels<T>(_is_timed: bool, run: impl FnOnce() -> T) -> (T, Vec<K
 }
 
 /// Returns the bytes that the allocator of an open GPU holds; `None` for a CPU.
-#[cfg(feature = "wgpu")]
 pub fn reserved_bytes(device: &Device) -> Option<u64> {
-    let device = device.clone().without_autodiff();
-    let burn::backend::DispatchDevice::Cube(device) = device.as_dispatch() else { return None };
-    Some(clift_cube::reserved_bytes(&device.client()))
-}
-
-/// Returns nothing: this build has no GPU kernels.
-#[cfg(not(feature = "wgpu"))]
-pub fn reserved_bytes(_device: &Device) -> Option<u64> {
-    None
+    match device.clone().without_autodiff().as_dispatch() {
+        #[cfg(feature = "wgpu")]
+        burn::backend::DispatchDevice::Cube(device) => Some(clift_cube::reserved_bytes(&device.client())),
+        _ => None,
+    }
 }
 
 /// Returns the path of a kernel without generic arguments, the type inside its module and the crate.

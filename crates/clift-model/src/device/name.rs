@@ -123,22 +123,20 @@ fn open_nth_wgpu(index: usize) -> Result<(Device, Option<String>), ModelError> {
 fn open_wgpu() -> Result<Device, ModelError> {
     use crate::device::adapter::{ADAPTER_VARIABLE, adapters};
     use burn::tensor::{DeviceKind, DeviceType};
+    let missing = |reason: String| Err(ModelError::NoDevice { name: "wgpu".into(), reason });
     // wgpu panics when it opens a device without an adapter.
     let num_adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
     if num_adapters == 0 {
-        return Err(ModelError::NoDevice {
-            name: "wgpu".into(),
-            reason: "no adapter was found; install a Vulkan driver (for software rendering: Mesa's lavapipe)".into(),
-        });
+        return missing(
+            "no adapter was found; install a Vulkan driver (for software rendering: Mesa's lavapipe)".into(),
+        );
     }
     // wgpu also panics if the environment variable selects an adapter that does not exist.
     if let Ok(chosen) = std::env::var(ADAPTER_VARIABLE) {
         let adapters = std::panic::catch_unwind(adapters).unwrap_or_default();
         if !adapters.iter().any(|adapter| adapter.is_used) {
-            let known: Vec<_> = adapters.iter().map(|adapter| adapter.selector.as_str()).collect();
-            let reason =
-                format!("{ADAPTER_VARIABLE} is `{chosen}`, which is not found; the adapters are {}", known.join(", "));
-            return Err(ModelError::NoDevice { name: "wgpu".into(), reason });
+            let known = adapters.iter().map(|adapter| adapter.selector.as_str()).collect::<Vec<_>>().join(", ");
+            return missing(format!("{ADAPTER_VARIABLE} is `{chosen}`, which is not found; the adapters are {known}"));
         }
     }
     #[cfg(feature = "spirv")]
