@@ -71,11 +71,10 @@ fn ssim_of_planes(pred: Vec<f64>, target: Vec<f64>, width: usize) -> f64 {
 }
 
 fn gaussian_taps() -> [f64; SSIM_MIN_SIZE_PX] {
-    let mut taps = [0.0; SSIM_MIN_SIZE_PX];
-    for (i, tap) in taps.iter_mut().enumerate() {
+    let taps: [f64; SSIM_MIN_SIZE_PX] = std::array::from_fn(|i| {
         let distance_px = i as f64 - SSIM_RADIUS as f64;
-        *tap = (-0.5 * (distance_px / SSIM_SIGMA_PX).powi(2)).exp();
-    }
+        (-0.5 * (distance_px / SSIM_SIGMA_PX).powi(2)).exp()
+    });
     let sum: f64 = taps.iter().sum();
     taps.map(|tap| tap / sum)
 }

@@ -69,9 +69,7 @@ impl Lpips {
         let pixels = TensorData::new(image.to_vec(), [1, height, width, 3]);
         let dtype = self.heads[0].dtype();
         let pixels = Tensor::<4>::from_data(pixels, (&self.device, dtype)).permute([0, 3, 1, 2]); // [1, 3, H, W]
-        let channel = |values: [f32; 3]| {
-            Tensor::<1>::from_data(TensorData::new(values.to_vec(), [3]), (&self.device, dtype)).reshape([1, 3, 1, 1])
-        };
+        let channel = |values: [f32; 3]| Tensor::<1>::from_data(values, (&self.device, dtype)).reshape([1, 3, 1, 1]);
         let input = (pixels * 2.0 - 1.0 - channel(SHIFT)) / channel(SCALE);
         let unit = |feature: Tensor<4>| {
             let norm = feature.clone().square().sum_dim(1).sqrt() + MIN_NORM;

@@ -19,18 +19,13 @@ pub enum TokenCount {
 impl TokenCount {
     /// Returns the number of tokens for a scene of `num_tokens`.
     pub fn of(self, num_tokens: usize) -> Result<usize, ModelError> {
+        let bad = |reason: String| Err(ModelError::BadTokenCount { text: self.to_string(), reason });
         match self {
-            _ if num_tokens == 0 => Err(ModelError::BadTokenCount {
-                text: self.to_string(),
-                reason: "a scene without views has no tokens".into(),
-            }),
+            _ if num_tokens == 0 => bad("a scene without views has no tokens".into()),
             Self::Count(count) if (1..=num_tokens).contains(&count) => Ok(count),
+            Self::Count(_) => bad(format!("a scene has {num_tokens} tokens")),
             // The summand corrects rounding: 0.0625 * 48 may be 2.9999...
             Self::Share(share) => Ok(((num_tokens as f64 * share + 1e-9) as usize).clamp(1, num_tokens)),
-            Self::Count(count) => Err(ModelError::BadTokenCount {
-                text: count.to_string(),
-                reason: format!("a scene has {num_tokens} tokens"),
-            }),
         }
     }
 }

@@ -77,24 +77,22 @@ impl PatchGrids {
     /// - `draw`: of cameras of any size, `[batch, views, height, width, 3]`
     /// - returns `[batch, views, height, width, 3]` of the size of `targets`
     pub(crate) fn mean(self, patch_size: usize, targets: &Cameras, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
+        let options = (&targets.intrinsics.device(), targets.intrinsics.dtype());
+        // On a grid whose first patch begins `shift` pixels above and left of the image.
+        let shifted = |shift: usize| {
+            let moved = TensorData::new(vec![0.0, 0.0, shift as f64, shift as f64], [1, 1, 4]);
+            let cameras = Cameras {
+                height: targets.height + patch_size,
+                width: targets.width + patch_size,
+                c2w: targets.c2w.clone(),
+                intrinsics: targets.intrinsics.clone() + Tensor::<3>::from_data(moved, options),
+            };
+            draw(&cameras).narrow(2, shift, targets.height).narrow(3, shift, targets.width)
+        };
         let shifts = self.shifts(patch_size);
-        let shifted = shifts[1..].iter().map(|&shift| shifted(patch_size, targets, shift, &draw));
-        let sum = shifted.fold(draw(targets), |sum, image| sum + image);
+        let sum = shifts[1..].iter().fold(draw(targets), |sum, &shift| sum + shifted(shift));
         if shifts.len() == 1 { sum } else { sum / shifts.len() as f64 }
     }
-}
-
-/// Draws an image on a grid whose first patch begins `shift` pixels above and left of it.
-fn shifted(patch_size: usize, targets: &Cameras, shift: usize, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
-    let options = (&targets.intrinsics.device(), targets.intrinsics.dtype());
-    let moved = Tensor::from_data(TensorData::new(vec![0.0, 0.0, shift as f64, shift as f64], [1, 1, 4]), options);
-    let cameras = Cameras {
-        height: targets.height + patch_size,
-        width: targets.width + patch_size,
-        c2w: targets.c2w.clone(),
-        intrinsics: targets.intrinsics.clone() + moved,
-    };
-    draw(&cameras).narrow(2, shift, targets.height).narrow(3, shift, targets.width)
 }
 
 #[cfg(test)]

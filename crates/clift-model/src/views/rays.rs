@@ -2,7 +2,6 @@
 // B scenes, V views, H rows, W columns
 
 use burn::tensor::{Int, Tensor, assert_shape};
-
 use serde::{Deserialize, Serialize};
 use strum::Display;
 

@@ -42,13 +42,9 @@ pub fn infer_config<'a>(
     // One more than the largest number of a layer with at least half of the keys of the layer with the most: single stray keys do
     // not count.
     let count = |prefix: &str| {
+        let number = |key: &&str| key.strip_prefix(prefix)?.split_once('.')?.0.parse::<usize>().ok();
         let mut layers = BTreeMap::<usize, usize>::new();
-        for key in shapes.keys() {
-            let numbered = key.strip_prefix(prefix).and_then(|rest| rest.split_once('.'));
-            if let Some(Ok(number)) = numbered.map(|(number, _)| number.parse()) {
-                *layers.entry(number).or_insert(0) += 1;
-            }
-        }
+        shapes.keys().filter_map(number).for_each(|number| *layers.entry(number).or_insert(0) += 1);
         let most = layers.values().copied().max()?;
         let last = layers.into_iter().rev().find(|(_, count)| count * 2 >= most);
         last.map(|(number, _)| number.saturating_add(1))

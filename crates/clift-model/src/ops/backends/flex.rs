@@ -27,7 +27,8 @@ fn set() -> InstructionSet {
 impl Kernels for Flex {
     fn matmul_bf16(lhs: FlexTensor, rhs: FlexTensor) -> FlexTensor {
         let ([rows, inner], [_, columns]) = (lhs.shape().dims(), rhs.shape().dims());
-        let [lhs, rhs] = [lhs, rhs].map(stored_matrix);
+        // Copied unless rows or columns are contiguous.
+        let [lhs, rhs] = [lhs, rhs].map(|x| if is_transposed(&x) { x } else { contiguous(x) });
         let mut output = vec![0.0; rows * columns];
         native::matmul_bf16(set(), [rows, inner, columns], [matrix(&lhs), matrix(&rhs)], None, &mut output);
         tensor(output, [rows, columns])
@@ -274,11 +275,6 @@ fn values(tensor: &FlexTensor) -> &[f32] {
     debug_assert!(tensor.is_contiguous(), "values of a contiguous tensor");
     let start = tensor.layout().start_offset();
     &tensor.storage::<f32>()[start..start + tensor.layout().num_elements()]
-}
-
-/// Copies a matrix unless its rows or its columns are contiguous.
-fn stored_matrix(tensor: FlexTensor) -> FlexTensor {
-    if is_transposed(&tensor) { tensor } else { contiguous(tensor) }
 }
 
 fn matrix(tensor: &FlexTensor) -> Matrix<'_> {
