@@ -91,14 +91,15 @@ fn intrinsics_of_numbers<'de, D: Deserializer<'de>>(deserializer: D) -> Result<I
 }
 
 #[cfg(test)]
-mod tests {
+pub mod tests {
     use serde_json::{Value, json};
 
     use super::*;
 
-    fn view() -> Value {
+    /// A valid request.
+    pub fn view(seq: u64) -> Value {
         json!({
-            "type": "view", "seq": 7, "c2w": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, -2], "intrinsics": [1, 1.2, 0.5, 0.5],
+            "type": "view", "seq": seq, "c2w": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, -2], "intrinsics": [1, 1.2, 0.5, 0.5],
             "tokens": 16, "selection": "scaled", "precision": "f32", "size": 1, "budget_ms": null, "rest": false,
             "list_tokens": true,
         })
@@ -119,11 +120,11 @@ mod tests {
             ("path", json!("/etc/passwd")),
             ("type", json!("shell")),
         ] {
-            let mut message = view();
+            let mut message = view(7);
             message[key] = value.clone();
             assert!(serde_json::from_value::<Request>(message).is_err(), "{key} = {value}");
         }
         assert!(serde_json::from_str::<Request>(&"[".repeat(MAX_REQUEST_BYTES)).is_err());
-        assert!(serde_json::from_str::<Request>(&view().to_string().replace("-2", "1e999")).is_err());
+        assert!(serde_json::from_str::<Request>(&view(7).to_string().replace("-2", "1e999")).is_err());
     }
 }

@@ -108,11 +108,7 @@ impl RunScenes {
         // Without a request, the count nearest to that of `clift encode`, a quarter.
         let wanted = request.stored.unwrap_or(num_tokens / 4);
         let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
-        let options = EncodeOptions {
-            context: context.clone(),
-            stored_tokens: Some(TokenCount::Count(stored)),
-            ..self.options.clone()
-        };
+        let options = EncodeOptions { stored_tokens: Some(TokenCount::Count(stored)), ..options };
         let EncodedScene { mut scene, context: context_views, clusters, .. } =
             encode(&self.model, &self.reader, *index, &options)?;
         scene.tokens = RUN_FORMAT.round(&scene.tokens)?;

@@ -32,7 +32,7 @@ impl Refusal {
 #[derive(Clone, Debug)]
 pub struct Access {
     token: String,
-    address: SocketAddr,
+    pub address: SocketAddr,
 }
 
 impl Access {

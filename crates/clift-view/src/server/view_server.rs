@@ -40,7 +40,6 @@ const SOCKET_PATH: &str = "/socket";
 #[derive(Debug)]
 pub struct ViewServer {
     listener: TcpListener,
-    address: SocketAddr,
     access: Access,
 }
 
@@ -60,12 +59,12 @@ impl ViewServer {
             Ok((listener.local_addr()?, listener))
         };
         let (address, listener) = bind().map_err(|source| ViewError::Bind { address, source })?;
-        Ok(Self { listener, address, access: Access::new(address) })
+        Ok(Self { listener, access: Access::new(address) })
     }
 
     /// Returns the address with the port.
     pub fn address(&self) -> SocketAddr {
-        self.address
+        self.access.address
     }
 
     /// Returns the URL of the page, with the token.

@@ -177,12 +177,7 @@ mod tests {
     use super::*;
 
     fn view(seq: u64) -> Request {
-        let text = format!(
-            r#"{{"type": "view", "seq": {seq}, "c2w": [1,0,0,0,0,1,0,0,0,0,1,0], "intrinsics": [1,1,0.5,0.5],
-                "tokens": 4, "selection": "paper", "precision": "f32", "size": 0, "budget_ms": null, "rest": false,
-                "list_tokens": false}}"#
-        );
-        serde_json::from_str(&text).unwrap()
+        serde_json::from_str(&crate::protocol::request::tests::view(seq).to_string()).unwrap()
     }
 
     /// Takes the next job, which must be a view, and sends an empty frame.
