@@ -61,13 +61,10 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    let setup = match Setup::make() {
-        Ok(setup) => setup,
-        Err(error) => {
-            eprintln!("making the valid files failed: {error}");
-            return ExitCode::FAILURE;
-        }
-    };
+    let setup = Setup::make().unwrap_or_else(|error| {
+        eprintln!("making the valid files failed: {error}");
+        std::process::exit(1)
+    });
     std::panic::set_hook(Box::new(|info| {
         let text = info.payload_as_str().unwrap_or("no message").lines().next().unwrap_or_default().to_owned();
         let place = info.location().map(|place| format!(" at {}:{}", place.file(), place.line())).unwrap_or_default();

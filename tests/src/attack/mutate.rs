@@ -63,11 +63,7 @@ impl Mutator<'_> {
             9 => replace_digits(bytes, at, rng),
             _ if self.words.is_empty() => bytes[at] ^= 0x80,
             10 => insert(bytes, at, self.words[below(rng, self.words.len())]),
-            _ => {
-                let word = self.words[below(rng, self.words.len())];
-                let end = (at + word.len()).min(bytes.len());
-                bytes[at..end].copy_from_slice(&word[..end - at]);
-            }
+            _ => overwrite(bytes, at, self.words[below(rng, self.words.len())]),
         }
     }
 }
@@ -82,26 +78,29 @@ fn insert(bytes: &mut Vec<u8>, at: usize, part: &[u8]) {
     }
 }
 
+/// Overwrites the bytes from a place on, as far as there are any.
+fn overwrite(bytes: &mut [u8], at: usize, part: &[u8]) {
+    let len = part.len().min(bytes.len() - at);
+    bytes[at..at + len].copy_from_slice(&part[..len]);
+}
+
 /// A number of 1, 2, 4 or 8 bytes in either order, perhaps near the file's own length.
 fn overwrite_number(bytes: &mut [u8], at: usize, rng: &mut ChaCha8Rng) {
-    let width = 1 << below(rng, 4);
+    let width = 1_usize << below(rng, 4);
     let number = match below(rng, 4) {
         0 => (bytes.len() as u64).wrapping_add(rng.random_range(0..5)).wrapping_sub(2),
         1 => {
             let mut there = [0; 8];
-            let end = (at + width).min(bytes.len());
-            there[..end - at].copy_from_slice(&bytes[at..end]);
+            overwrite(&mut there[..width], 0, &bytes[at..]);
             u64::from_le_bytes(there).wrapping_add(rng.random_range(0..17)).wrapping_sub(8)
         }
         _ => word_of(NUMBERS, rng).parse().expect("a number"),
     };
-    let little = number.to_le_bytes();
-    let mut part = little[..width].to_vec();
+    let mut part = number.to_le_bytes()[..width].to_vec();
     if rng.random_bool(0.5) {
         part.reverse();
     }
-    let end = (at + width).min(bytes.len());
-    bytes[at..end].copy_from_slice(&part[..end - at]);
+    overwrite(bytes, at, &part);
 }
 
 /// Replaces the next number of a text.

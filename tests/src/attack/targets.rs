@@ -113,15 +113,12 @@ fn scene_checksum(bytes: &mut [u8]) {
 
 /// Writes the checksum of every block of a PNG, as far as its blocks can be followed.
 fn png_checksums(bytes: &mut [u8]) {
-    let mut at = 8;
-    while at + 12 <= bytes.len() {
-        let len = u32::from_be_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]) as usize;
-        let Some(end) = at.checked_add(8).and_then(|start| start.checked_add(len)).filter(|end| end + 4 <= bytes.len())
-        else {
-            return;
-        };
-        let checksum = crc32fast::hash(&bytes[at + 4..end]).to_be_bytes();
-        bytes[end..end + 4].copy_from_slice(&checksum);
-        at = end + 4;
+    let mut rest = bytes.get_mut(8..).unwrap_or_default();
+    while let Some(len) = rest.first_chunk::<4>() {
+        let end = 8 + u32::from_be_bytes(*len) as usize;
+        let Some((block, after)) = rest.split_at_mut_checked(end) else { return };
+        let Some((checksum, after)) = after.split_first_chunk_mut::<4>() else { return };
+        *checksum = crc32fast::hash(&block[4..]).to_be_bytes();
+        rest = after;
     }
 }
