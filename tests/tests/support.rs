@@ -120,7 +120,8 @@ pub fn finish(child: Child) -> Ran {
 pub struct Shared {
     words: &'static str,
     set: &'static [&'static str],
-    files: OnceLock<BTreeMap<PathBuf, Vec<u8>>>,
+    /// The folder in which it was trained, and its files.
+    files: OnceLock<(String, BTreeMap<PathBuf, Vec<u8>>)>,
 }
 
 /// The whole micro run, with its evaluation.
@@ -194,25 +195,20 @@ impl Place {
 
     /// Copies a shared run to `name`, as if it had been trained here.
     pub fn copy(&self, shared: &Shared, name: &str) {
-        // The only file that holds the path of its run.
-        let config = Path::new("config.toml");
-        let moved = |bytes: &[u8], from: &Path, to: &Path| {
-            let text = String::from_utf8(bytes.to_vec()).expect("text");
-            text.replace(&from.display().to_string(), &to.display().to_string()).into_bytes()
-        };
-        let files = shared.files.get_or_init(|| {
+        let (former, files) = shared.files.get_or_init(|| {
             let place = Self::new();
             place.train(shared.words, shared.set).ok();
-            let run = place.at("run");
-            let mut found = files(&run);
-            let text = found.get_mut(config).expect("a config");
-            *text = moved(text, &run, Path::new("RUN"));
-            found
+            (place.at("run").display().to_string(), files(&place.at("run")))
         });
-        let run = self.at(name);
+        let run = self.at(name).display().to_string();
         for (path, bytes) in files {
-            let moved = (path == config).then(|| moved(bytes, Path::new("RUN"), &run));
-            self.write(&format!("{name}/{}", path.display()), moved.as_ref().unwrap_or(bytes));
+            let name = format!("{name}/{}", path.display());
+            // The only file that holds the path of its run.
+            if path == Path::new("config.toml") {
+                self.write(&name, String::from_utf8_lossy(bytes).replace(former, &run));
+            } else {
+                self.write(&name, bytes);
+            }
         }
     }
 
@@ -362,11 +358,11 @@ pub fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("{key} is not a number: {value}"))
 }
 
-/// The first point of an evaluation with these values.
+/// The first of some points of an evaluation with these values.
 #[track_caller]
-pub fn point<'a>(points: &'a [Value], variant: &str, num_storage_tokens: usize) -> &'a Value {
+pub fn point<'a>(points: impl IntoIterator<Item = &'a Value>, variant: &str, num_storage_tokens: usize) -> &'a Value {
     let is_it = |point: &&Value| point["method"] == variant && point["num_storage_tokens"] == num_storage_tokens;
-    points.iter().find(is_it).unwrap_or_else(|| panic!("no {variant} of {num_storage_tokens} tokens"))
+    points.into_iter().find(is_it).unwrap_or_else(|| panic!("no {variant} of {num_storage_tokens} tokens"))
 }
 
 pub fn copy_folder(from: &Path, to: &Path) {

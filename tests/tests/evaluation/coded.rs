@@ -2,7 +2,7 @@
 
 use clift_scene::{Scene, TokenCodec, TokenCoding};
 
-use crate::support::{LONGER, Place, STAGE_1, WHOLE, number};
+use crate::support::{LONGER, Place, STAGE_1, WHOLE, number, point};
 
 const KEY: &str = "synthetic-0-test-00000";
 const CODEC: &str = "run/stage2/codec.safetensors";
@@ -17,12 +17,8 @@ fn coded_files_have_the_size_and_quality_of_the_evaluation() {
     let place = Place::with(&LONGER);
     place.eval("run --format f32,coded,coded-1 --set eval.num_scenes=1 --out DIR/coded").ok();
     let points = place.points("coded");
-    let of = |tokens: &str, count: usize| {
-        let is_it = |point: &&serde_json::Value| {
-            point["method"] == "clift" && point["tokens"] == tokens && point["num_storage_tokens"] == count
-        };
-        points.iter().find(is_it).unwrap_or_else(|| panic!("no {tokens}, {count}: {points:?}"))
-    };
+    let of =
+        |tokens: &str, count: usize| point(points.iter().filter(|point| point["tokens"] == tokens), "clift", count);
     encode(&place, "").ok().prints("(clift, coded, expected loss 0.02 dB)");
     for tokens in ["coded", "coded-1"] {
         for count in [4, 8] {

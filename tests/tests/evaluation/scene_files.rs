@@ -6,10 +6,10 @@ use clift_data::{Clip, ClipReader, Split, even_views, open_dataset};
 use clift_model::{SelectionPreset, TokenKind, psnr};
 use clift_scene::{Scene, TokenCoding, TokenFormat};
 use clift_train::{Config, read_config};
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::support::{
-    BINARY, LONGER, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, signal, start, wait_until,
+    BINARY, LONGER, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
 };
 
 /// [`WHOLE`] with camera-relative attention.
@@ -86,10 +86,8 @@ fn scene_files_reproduce_the_evaluation() {
         let bytes = place.bytes("room.clift").len() as u64;
         assert_eq!(bytes, 8 + 2048 + 136 + 164 * 2 + 140 + 4 * 2 + (count * (28 + format.bytes_per_token(16))) as u64);
         assert_eq!(bytes, scene.file_bytes(format));
-        let is_it = |point: &&Value| {
-            point["method"] == "clift" && point["tokens"] == storage && point["num_storage_tokens"] == count
-        };
-        assert_eq!(points.iter().find(is_it).expect("measured")["scene_bytes"], bytes);
+        let of_format = points.iter().filter(|point| point["tokens"] == storage);
+        assert_eq!(point(of_format, "clift", count)["scene_bytes"], bytes);
 
         let [of_format, exact] =
             [format, TokenFormat::F32].map(|format| evaluated(&place, "formats", format, [count; 2]));
