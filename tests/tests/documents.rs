@@ -160,10 +160,7 @@ fn smaller(line: &str) -> String {
 fn make_room(folder: &Path, args: &[String]) {
     let is_output = |flag: &str| ["-o", "--out", "--json", "--csv"].contains(&flag);
     let flags = args.windows(2).filter(|pair| is_output(&pair[0])).map(|pair| &pair[1]);
-    let positional = match [args[0].as_str(), args.get(1).map_or("", String::as_str)] {
-        ["data", "synth"] => args.get(2),
-        _ => None,
-    };
+    let positional = args.get(2).filter(|_| args.starts_with(&["data".into(), "synth".into()]));
     for path in flags.chain(positional) {
         let path = folder.join(path);
         drop(if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) });
@@ -267,22 +264,19 @@ fn prepare(base: &Path) {
     write_first_stage(&base.join("first_stage.ckpt"));
 
     let clift = |args: &[&str]| drop(finish(start(Command::new(BINARY).args(args).current_dir(base))).ok());
-    let config = repository("tests/micro.toml");
-    let train = |run: &str, key: &str| {
-        let run_dir = format!("run_dir={run}");
-        clift(&["train", config.to_str().expect("text"), "--set", &run_dir, "--set", key]);
+    let config = repository("tests/micro.toml").display().to_string();
+    let train = |keys: &[&str]| {
+        let sets = keys.iter().flat_map(|&key| ["--set", key]);
+        clift(&["train", &config].into_iter().chain(sets).collect::<Vec<_>>());
     };
-    train("runs/tiny", "eval.formats=['f32', 'f16']");
-    train("runs/re10k", SMALL_DATA);
+    train(&["run_dir=runs/tiny", "eval.formats=['f32', 'f16']"]);
+    train(&["run_dir=runs/re10k", SMALL_DATA]);
     // An example replaces PATH.
-    train("runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR"));
+    train(&["run_dir=runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR")]);
     for count in [64, 16] {
-        let keys = format!(
-            "run_dir='runs/lvsm-{count}' model.architecture='lvsm-ed' model.num_latents={count} \
-             model.condenser={{num_blocks=0}} stage1.keep_tokens=[1.0,1.0]"
-        );
-        let sets = keys.split_whitespace().flat_map(|key| ["--set", key]);
-        clift(&["train", config.to_str().expect("text")].into_iter().chain(sets).collect::<Vec<_>>());
+        let (run_dir, latents) = (format!("run_dir=runs/lvsm-{count}"), format!("model.num_latents={count}"));
+        let lvsm = ["model.architecture='lvsm-ed'", "model.condenser={num_blocks=0}", "stage1.keep_tokens=[1.0,1.0]"];
+        train(&[&lvsm[..], &[run_dir.as_str(), latents.as_str()]].concat());
     }
     for name in ["runs/a", "runs/b"] {
         copy(&base.join("runs/tiny"), name);

@@ -88,18 +88,15 @@ impl Chromium {
                 let error = answer["error"].take();
                 return if error.is_null() { Ok(answer["result"].take()) } else { Err(error) };
             }
-            self.note_problem(&answer);
-        }
-    }
-
-    fn note_problem(&mut self, event: &Value) {
-        let params = &event["params"];
-        match event["method"].as_str() {
-            Some("Runtime.exceptionThrown") => self.problems.push(params["exceptionDetails"].to_string()),
-            Some("Log.entryAdded") if params["entry"]["level"] == "error" => {
-                self.problems.push(params["entry"]["text"].to_string());
+            // An event of the page.
+            let params = &answer["params"];
+            match answer["method"].as_str() {
+                Some("Runtime.exceptionThrown") => self.problems.push(params["exceptionDetails"].to_string()),
+                Some("Log.entryAdded") if params["entry"]["level"] == "error" => {
+                    self.problems.push(params["entry"]["text"].to_string());
+                }
+                _ => {}
             }
-            _ => {}
         }
     }
 

@@ -114,24 +114,19 @@ fn message(random: &mut ChaCha8Rng, round: usize) -> Message {
         )
     };
     let unit = "[1,0,0,0,0,1,0,0,0,0,1,0]";
-    match random.random_range(0..12) {
-        0 => Message::binary((0..random.random_range(0..300)).map(|_| random.random()).collect::<Vec<u8>>()),
-        1 => Message::text("x".repeat(random.random_range(0..100_000))),
-        2 => Message::text(view(unit, "18446744073709551615", "18446744073709551615")),
-        3 => Message::text(view("[1e308,0,0,0,0,1e308,0,0,0,0,1e308,0]", "4", "0")),
-        4 => Message::text(view(unit, "-4", "0")),
-        5 => Message::text(format!(r#"{{"type":"ack","seq":{}}}"#, random.random::<u64>())),
-        6 => Message::text(r#"{"type":"open","scene":4000000000,"stored":1}"#),
-        7 => {
-            Message::text(format!(r#"{{"type":"open","scene":{},"stored":{}}}"#, round % 3, random.random_range(0..99)))
-        }
-        8 => Message::text(
-            r#"{"type":"compare","frame":99999,"tokens":0,"selection":"paper","precision":"f32","image":true}"#,
-        ),
-        9 => Message::text(
-            r#"{"type":"compare","frame":0,"tokens":0,"selection":"paper","precision":"f32","image":true}"#,
-        ),
-        10 => Message::text("[".repeat(4000)),
-        _ => Message::Ping(vec![0; 100].into()),
-    }
+    let text = match random.random_range(0..12) {
+        0 => return Message::binary((0..random.random_range(0..300)).map(|_| random.random()).collect::<Vec<u8>>()),
+        1 => "x".repeat(random.random_range(0..100_000)),
+        2 => view(unit, "18446744073709551615", "18446744073709551615"),
+        3 => view("[1e308,0,0,0,0,1e308,0,0,0,0,1e308,0]", "4", "0"),
+        4 => view(unit, "-4", "0"),
+        5 => format!(r#"{{"type":"ack","seq":{}}}"#, random.random::<u64>()),
+        6 => r#"{"type":"open","scene":4000000000,"stored":1}"#.into(),
+        7 => format!(r#"{{"type":"open","scene":{},"stored":{}}}"#, round % 3, random.random_range(0..99)),
+        8 => r#"{"type":"compare","frame":99999,"tokens":0,"selection":"paper","precision":"f32","image":true}"#.into(),
+        9 => r#"{"type":"compare","frame":0,"tokens":0,"selection":"paper","precision":"f32","image":true}"#.into(),
+        10 => "[".repeat(4000),
+        _ => return Message::Ping(vec![0; 100].into()),
+    };
+    Message::text(text)
 }
