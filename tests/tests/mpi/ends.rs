@@ -18,7 +18,7 @@ fn a_killed_rank_ends_the_others_within_seconds() {
     let place = Place::new();
     let mut child = start_train(&place, 3, "run", &LONG);
     place.wait_for_steps("run", &mut child, 60);
-    let ids = ranks_of(&child);
+    let ids = ranks_of(child.id());
     assert_eq!(ids.len(), 3);
     let killed = Instant::now();
     signal(ids[2], "-KILL");
@@ -38,7 +38,7 @@ fn a_signal_to_one_rank_saves_the_run() {
     let place = Place::new();
     let mut child = start_train(&place, 2, "run", &LONG);
     place.wait_for_steps("run", &mut child, 60);
-    signal(ranks_of(&child)[1], "-TERM");
+    signal(ranks_of(child.id())[1], "-TERM");
     let ran = finish(child);
     assert_eq!(num_errors(&ran), 1, "{}", ran.stderr);
     assert!(ran.stderr.contains("error: interrupted at step "), "{}", ran.stderr);

@@ -12,34 +12,23 @@ pub fn one_at_a_time() -> MutexGuard<'static, ()> {
     ONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// `mpirun` with `num_ranks` ranks of one thread, also as root, on any number of cores.
-pub fn mpirun(num_ranks: usize) -> Command {
+/// Starts a training by `num_ranks` ranks of one thread, also as root, on any number of cores.
+pub fn start_train(place: &Place, num_ranks: usize, words: &str, set: &[&str]) -> Child {
     let mut command = Command::new("mpirun");
-    command.args(["-n", &num_ranks.to_string()]).env("RAYON_NUM_THREADS", "1");
-    for (name, value) in [
+    command.args(["-n", &num_ranks.to_string()]).env("RAYON_NUM_THREADS", "1").envs([
         ("OMPI_ALLOW_RUN_AS_ROOT", "1"),
         ("OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "1"),
         ("OMPI_MCA_rmaps_base_oversubscribe", "1"),
         ("OMPI_MCA_hwloc_base_binding_policy", "none"),
         // Ranks that wait let others compute.
         ("OMPI_MCA_mpi_yield_when_idle", "1"),
-    ] {
-        command.env(name, value);
-    }
-    command
+    ]);
+    start(command.arg(BINARY).args(place.train_args(words, set)))
 }
 
-pub fn start_train(place: &Place, num_ranks: usize, words: &str, set: &[&str]) -> Child {
-    start(mpirun(num_ranks).arg(BINARY).args(place.train_args(words, set)))
-}
-
-/// The process ids of the ranks of a running `mpirun`, in no order.
-pub fn ranks_of(mpirun: &Child) -> Vec<u32> {
-    ranks_of_id(mpirun.id())
-}
-
-fn ranks_of_id(id: u32) -> Vec<u32> {
-    let children = std::fs::read_to_string(format!("/proc/{id}/task/{id}/children")).unwrap_or_default();
+/// The process ids of the ranks of a running `mpirun`, given by its own, in no order.
+pub fn ranks_of(mpirun: u32) -> Vec<u32> {
+    let children = std::fs::read_to_string(format!("/proc/{mpirun}/task/{mpirun}/children")).unwrap_or_default();
     let is_rank =
         |id: &u32| std::fs::read_to_string(format!("/proc/{id}/cmdline")).is_ok_and(|words| words.starts_with(BINARY));
     children.split_whitespace().filter_map(|id| id.parse().ok()).filter(is_rank).collect()
@@ -61,7 +50,7 @@ pub fn end_within_a_minute(mpirun: &Child) {
             }
         }
         eprintln!("mpirun {id} did not end within a minute of a killed rank: ended by the test");
-        ranks_of_id(id).into_iter().chain([id]).for_each(|id| signal(id, "-KILL"));
+        ranks_of(id).into_iter().chain([id]).for_each(|id| signal(id, "-KILL"));
     });
 }
 

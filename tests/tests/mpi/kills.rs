@@ -54,14 +54,14 @@ fn runs_with_killed_ranks_end_the_same_on_any_number_of_ranks() {
             let mut child = start_train(&place, num_ranks, &name, &SAVING);
             if num_ranks == 2 && num_kills < NUM_KILLS {
                 wait_at_most(whole.mul_f64(draw(&mut state)), &mut child);
-                let ids = ranks_of(&child);
+                let ids = ranks_of(child.id());
                 if !ids.is_empty() {
                     signal(ids[(draw(&mut state) * ids.len() as f64) as usize], "-KILL");
                 }
             } else if num_kills < NUM_KILLS {
                 // One or three ranks make a few steps of the rest.
                 wait_at_most(whole.mul_f64(0.3 * draw(&mut state)), &mut child);
-                ranks_of(&child).into_iter().take(1).for_each(|id| signal(id, "-KILL"));
+                ranks_of(child.id()).into_iter().take(1).for_each(|id| signal(id, "-KILL"));
             }
             if num_kills < NUM_KILLS {
                 end_within_a_minute(&child);
