@@ -10,6 +10,7 @@ use safetensors::{Dtype, SafeTensors};
 use crate::device::name::DeviceName;
 use crate::network::architecture::{Architecture, CliftVariant};
 use crate::network::config::{CondenserConfig, ModelConfig};
+use crate::views::upload::Cameras;
 
 /// Opens the CPU devices of this build, which support f64. The suite `wgpu_suite` compares wgpu with them.
 pub fn devices() -> Vec<Device> {
@@ -95,6 +96,14 @@ impl Fixture {
 
     pub fn tensor_f64<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
         Tensor::from_data(self.data(name), (device, DType::F64))
+    }
+
+    /// Returns cameras of 16 x 24 pixels, whose names start with `prefix`.
+    pub fn cameras(&self, prefix: &str, device: &Device, dtype: DType) -> Cameras {
+        let data = |name: &str| self.data(&format!("input.{prefix}{name}"));
+        let c2w = Tensor::from_data(data("c2w"), (device, dtype));
+        let intrinsics = Tensor::from_data(data("intrinsics"), (device, dtype));
+        Cameras { height: 16, width: 24, c2w, intrinsics }
     }
 
     pub fn integers(&self, name: &str) -> Vec<i64> {

@@ -103,13 +103,7 @@ mod tests {
         let wide = devices().into_iter().map(|device| (device, DType::F64, 1e-6));
         let cases = devices().into_iter().map(|device| (device, DType::F32, 1e-5)).chain(wide);
         for (device, dtype, tolerance) in cases {
-            let cameras = |prefix: &str| Cameras {
-                height: 16,
-                width: 24,
-                c2w: fixture.tensor_f64::<4>(&format!("input.{prefix}c2w"), &device).cast(dtype),
-                intrinsics: fixture.tensor_f64::<3>(&format!("input.{prefix}intrinsics"), &device).cast(dtype),
-            };
-            let (targets, context) = (cameras("target_"), cameras(""));
+            let [targets, context] = ["target_", ""].map(|prefix| fixture.cameras(prefix, &device, dtype));
             let read = |name: &str| fixture.tensor_f64::<3>(name, &device).cast(dtype);
             let inputs = ["input.q", "input.key_value"].map(read);
             let attend = |inputs| attend([&targets, &context], inputs);

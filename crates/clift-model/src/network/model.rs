@@ -167,16 +167,11 @@ mod tests {
         let Network { encoder, renderer, .. } = Network::new(config, 0, device);
         let encoder = load_weights(encoder, fixture, "weight.encoder.");
         let renderer = load_weights(renderer, fixture, "weight.renderer.");
-        let cameras = |kind: &str| Cameras {
-            height: 16,
-            width: 24,
-            c2w: fixture.tensor(&format!("input.{kind}_c2w"), device),
-            intrinsics: fixture.tensor(&format!("input.{kind}_intrinsics"), device),
-        };
-        let context = Views { images: fixture.tensor("input.context_images", device), cameras: cameras("context") };
+        let cameras = |prefix: &str| fixture.cameras(prefix, device, DType::F32);
+        let context = Views { images: fixture.tensor("input.context_images", device), cameras: cameras("context_") };
         let tokens = encoder.forward(&context);
         let lift = tokens.values.clone();
-        let rendering = renderer.forward(tokens, &cameras("target"));
+        let rendering = renderer.forward(tokens, &cameras("target_"));
         let loss = (rendering.clone() - fixture.tensor("input.target_images", device)).square().mean();
         ForwardPass { encoder, renderer, lift, rendering, loss }
     }

@@ -103,9 +103,7 @@ mod tests {
         let fixture = Fixture::open("rays");
         for device in devices() {
             for dtype in [DType::F32, DType::F64] {
-                let c2w = fixture.tensor_f64("input.c2w", &device).cast(dtype);
-                let intrinsics = fixture.tensor_f64("input.intrinsics", &device).cast(dtype);
-                let rays = plucker(&Cameras { height: 16, width: 24, c2w, intrinsics });
+                let rays = plucker(&fixture.cameras("", &device, dtype));
                 assert_eq!(rays.dtype(), dtype);
                 // f32 against f64: a few roundings of values up to 2.
                 assert_close(&rays, &fixture.tensor_f64::<5>("output.plucker", &device), 2e-6);
