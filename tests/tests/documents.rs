@@ -267,7 +267,7 @@ fn prepare(base: &Path) {
     let config = repository("tests/micro.toml").display().to_string();
     let train = |keys: &[&str]| {
         let sets = keys.iter().flat_map(|&key| ["--set", key]);
-        clift(&["train", &config].into_iter().chain(sets).collect::<Vec<_>>());
+        clift(&["train", config.as_str()].into_iter().chain(sets).collect::<Vec<_>>());
     };
     train(&["run_dir=runs/tiny", "eval.formats=['f32', 'f16']"]);
     train(&["run_dir=runs/re10k", SMALL_DATA]);

@@ -99,9 +99,9 @@ pub mod tests {
     /// A valid request.
     pub fn view(seq: u64) -> Value {
         json!({
-            "type": "view", "seq": seq, "c2w": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, -2], "intrinsics": [1, 1.2, 0.5, 0.5],
-            "tokens": 16, "selection": "scaled", "precision": "f32", "size": 1, "budget_ms": null, "rest": false,
-            "list_tokens": true,
+            "type": "view", "seq": seq, "c2w": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, -2],
+            "intrinsics": [1, 1.2, 0.5, 0.5], "tokens": 16, "selection": "scaled", "precision": "f32", "size": 1,
+            "budget_ms": null, "rest": false, "list_tokens": true,
         })
     }
 
