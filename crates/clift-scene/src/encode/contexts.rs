@@ -25,8 +25,8 @@ pub struct EncodeOptions {
     pub context: ContextChoice,
     /// One frame of this many is held out: it is not a context view. 0 for none.
     pub hold_out: usize,
-    /// Number of stored tokens of all groups; `None` for a quarter (of many groups down to an eighth), or for all tokens of a
-    /// network without clusters.
+    /// Number of stored tokens of all groups; `None` for a quarter of one group, a half of several (of many down to an
+    /// eighth), or for all tokens of a network without clusters.
     pub stored_tokens: Option<TokenCount>,
     /// Token groups that the model was trained on.
     pub grouping: Grouping,

@@ -74,11 +74,11 @@ pub fn encode(
     Ok(EncodedScene { scene, context, clusters })
 }
 
-/// Returns the share of all tokens that is stored by default: a quarter, but of many groups an eighth at least and `MOST` tokens
-/// at most, which `models/rooms` codes in about 370 kB.
-fn default_share(num_tokens: usize) -> f64 {
+/// Returns the share of all tokens that is stored by default: a quarter of one group, a half of several, but of many an eighth at
+/// least and `MOST` tokens at most, which `models/rooms` codes in about 370 kB.
+fn default_share(num_tokens: usize, num_groups: usize) -> f64 {
     const MOST: f64 = 7680.0;
-    (MOST / num_tokens as f64).clamp(0.125, 0.25)
+    if num_groups == 1 { 0.25 } else { (MOST / num_tokens as f64).clamp(0.125, 0.5) }
 }
 
 /// Returns the number of stored tokens of every group of `sizes` views: a share of its tokens, or an equal part of a number.
@@ -101,7 +101,7 @@ fn token_counts(
             _ => Ok(all),
         };
     }
-    match stored_tokens.unwrap_or(TokenCount::Share(default_share(sum))) {
+    match stored_tokens.unwrap_or(TokenCount::Share(default_share(sum, sizes.len()))) {
         share @ TokenCount::Share(_) => all.iter().map(|&all| share.of(all)).collect(),
         count @ TokenCount::Count(_) => {
             let (count, groups) = (count.of(sum)?, sizes.len());
@@ -157,10 +157,12 @@ mod tests {
         // Views of 2 x 3 patches.
         let counts =
             |sizes: &[usize], stored| token_counts(&model, [16, 24], sizes, stored).map_err(|error| error.to_string());
-        assert_eq!(counts(&[4, 4, 2], None).unwrap(), [6, 6, 3]);
+        assert_eq!(counts(&[4, 4, 2], None).unwrap(), [12, 12, 6]);
         assert_eq!(counts(&[4, 4, 4], Some(TokenCount::Count(20))).unwrap(), [6, 7, 7]);
         assert_eq!(counts(&[4, 1], Some(TokenCount::Count(30))).unwrap(), [15, 6], "no more than the group has");
-        assert_eq!([1024, 40_000, 100_000].map(default_share), [0.25, 0.192, 0.125]);
+        let shares =
+            [(1024, 1), (2048, 2), (40_000, 40), (100_000, 90)].map(|(all, groups)| default_share(all, groups));
+        assert_eq!(shares, [0.25, 0.5, 0.192, 0.125]);
         let message = counts(&[2, 2, 2], Some(TokenCount::Count(2))).unwrap_err();
         assert!(message.contains("the scene has 3 groups of views"), "{message}");
     }
