@@ -358,7 +358,7 @@ pub fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("{key} is not a number: {value}"))
 }
 
-/// The first of some points of an evaluation with these values.
+/// The first of these points of an evaluation with this method and number of tokens.
 #[track_caller]
 pub fn point<'a>(points: impl IntoIterator<Item = &'a Value>, variant: &str, num_storage_tokens: usize) -> &'a Value {
     let is_it = |point: &&Value| point["method"] == variant && point["num_storage_tokens"] == num_storage_tokens;

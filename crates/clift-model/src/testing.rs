@@ -98,7 +98,7 @@ impl Fixture {
         Tensor::from_data(self.data(name), (device, DType::F64))
     }
 
-    /// Returns cameras of 16 x 24 pixels, whose names start with `prefix`.
+    /// Returns the cameras of the tensors `input.{prefix}c2w` and `input.{prefix}intrinsics`, of 24 columns and 16 rows.
     pub fn cameras(&self, prefix: &str, device: &Device, dtype: DType) -> Cameras {
         let data = |name: &str| self.data(&format!("input.{prefix}{name}"));
         let c2w = Tensor::from_data(data("c2w"), (device, dtype));

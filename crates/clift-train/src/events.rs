@@ -117,7 +117,8 @@ impl<F: FnMut(&Event)> Sink for F {
     }
 }
 
-/// Returns the events of an evaluation as those of a run. Scenes are counted if `is_stage`: not in a validation.
+/// Returns a receiver of the events of an evaluation that passes them on as events of a run. Scenes are counted only if
+/// `is_stage`: not in a validation.
 pub(crate) fn eval_events(sink: &mut dyn Sink, is_stage: bool) -> impl FnMut(EvalEvent<'_>) {
     let run_step = RunStep::Eval;
     move |event: EvalEvent| {

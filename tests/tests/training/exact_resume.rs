@@ -29,6 +29,7 @@ fn killed_runs_end_the_same_with_any_loader_threads() {
         assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
         place.eval(name).ok();
         assert_eq!(place.checkpoints(name, "stage1"), [17, 30]);
+        assert_eq!(place.progress(name, "stage2")["validated"], 30, "the checkpoint knows its validation");
         place.assert_same_run(name, "whole");
     }
 }

@@ -81,7 +81,7 @@ struct RenderJob<'a> {
     kept_views: &'a [usize],
 }
 
-/// The renderings of a scene.
+/// The renderings to make of a scene, and what they are made and scored with.
 struct SceneJobs<'a> {
     models: &'a EvalModels,
     clip: &'a Clip,
@@ -223,6 +223,7 @@ impl<'a> SceneJobs<'a> {
     }
 }
 
+/// Returns the key of a rendering from all stored tokens.
 fn key_of(method: Method, count: usize, coding: TokenCoding) -> EvalKey {
     EvalKey { method, num_storage_tokens: count, num_render_tokens: count, tokens: Some(coding) }
 }

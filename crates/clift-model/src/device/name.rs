@@ -139,15 +139,17 @@ fn open_wgpu() -> Result<Device, ModelError> {
             return missing(format!("{ADAPTER_VARIABLE} is `{chosen}`, which is not found; the adapters are {known}"));
         }
     }
-    #[cfg(feature = "spirv")]
-    refuse_old_mesa()?;
+    if cfg!(all(feature = "spirv", target_os = "linux")) {
+        refuse_old_mesa()?;
+    }
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
 }
 
-/// Refuses the software adapter of Mesa before 26, which crashes the process on kernels in SPIR-V.
-#[cfg(feature = "spirv")]
+/// Refuses Mesa's software Vulkan before 26, which crashes the process on kernels in SPIR-V.
+#[cfg(feature = "wgpu")]
 fn refuse_old_mesa() -> Result<(), ModelError> {
-    let Some(used) = crate::device::adapter::used_adapter().filter(|adapter| adapter.kind == "software") else {
+    let used = crate::device::adapter::used_adapter();
+    let Some(used) = used.filter(|adapter| adapter.kind == "software" && adapter.api == "Vulkan") else {
         return Ok(());
     };
     let version =

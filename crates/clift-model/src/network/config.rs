@@ -275,7 +275,8 @@ impl ModelConfig {
         check(has_halves, "model.patch_grids", usize::from(self.patch_grids), fix)
     }
 
-    fn is_camera_relative(&self) -> bool {
+    /// Returns whether attention depends on the cameras of tokens and queries.
+    pub(crate) fn is_camera_relative(&self) -> bool {
         self.camera_encoding != CameraEncoding::Plucker
     }
 }

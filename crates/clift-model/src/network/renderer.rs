@@ -6,7 +6,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
 
-use crate::network::architecture::{Architecture, CameraEncoding};
+use crate::network::architecture::Architecture;
 use crate::network::blocks::block::DecoderBlock;
 use crate::network::camera_encoding::transforms;
 use crate::network::config::ModelConfig;
@@ -119,7 +119,7 @@ impl Renderer {
                 block.forward(x, key_value, transforms.as_ref())
             })
         };
-        let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x));
+        let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x)); // [BT, Q, values of a patch]
         let [_, num_queries, values] = patches.dims();
         let patches = patches.reshape([batch, views * num_queries, values]);
         unpatchify(patches, [views, targets.height, targets.width], patch_size)
@@ -130,7 +130,7 @@ impl Renderer {
     fn accept(&self, tokens: RenderTokens) -> RenderTokens {
         assert_eq!(
             tokens.has_transforms(),
-            self.config.camera_encoding != CameraEncoding::Plucker,
+            self.config.is_camera_relative(),
             "camera-relative attention needs tokens with cameras, and plain attention tokens without: take those that the \
              network encoded, or render a scene with `SceneRenderer`"
         );
@@ -143,6 +143,7 @@ mod tests {
     use burn::tensor::{DType, Device};
 
     use super::*;
+    use crate::network::architecture::CameraEncoding;
     use crate::network::tokens::Tokens;
     use crate::testing::{assert_close, devices, random};
 

@@ -74,11 +74,11 @@ pub fn encode(
     Ok(EncodedScene { scene, context, clusters })
 }
 
-/// Returns the share of all tokens that is stored by default: a quarter of one group, a half of several, but of many an eighth at
-/// least and `MOST` tokens at most, which `models/rooms` codes in about 370 kB.
+/// Returns the share of all tokens that is stored by default: a quarter of one group, a half of several, but of many tokens `MOST`,
+/// which `models/rooms` codes in about 370 kB, or an eighth if that is more.
 fn default_share(num_tokens: usize, num_groups: usize) -> f64 {
     const MOST: f64 = 7680.0;
-    if num_groups == 1 { 0.25 } else { (MOST / num_tokens as f64).clamp(0.125, 0.5) }
+    (MOST / num_tokens as f64).clamp(0.125, if num_groups == 1 { 0.25 } else { 0.5 })
 }
 
 /// Returns the number of stored tokens of every group of `sizes` views: a share of its tokens, or an equal part of a number.
@@ -160,9 +160,9 @@ mod tests {
         assert_eq!(counts(&[4, 4, 2], None).unwrap(), [12, 12, 6]);
         assert_eq!(counts(&[4, 4, 4], Some(TokenCount::Count(20))).unwrap(), [6, 7, 7]);
         assert_eq!(counts(&[4, 1], Some(TokenCount::Count(30))).unwrap(), [15, 6], "no more than the group has");
-        let shares =
-            [(1024, 1), (2048, 2), (40_000, 40), (100_000, 90)].map(|(all, groups)| default_share(all, groups));
-        assert_eq!(shares, [0.25, 0.5, 0.192, 0.125]);
+        let shares = [(1024, 1), (40_000, 1), (2048, 2), (40_000, 40), (100_000, 90)]
+            .map(|(all, groups)| default_share(all, groups));
+        assert_eq!(shares, [0.25, 0.192, 0.5, 0.192, 0.125]);
         let message = counts(&[2, 2, 2], Some(TokenCount::Count(2))).unwrap_err();
         assert!(message.contains("the scene has 3 groups of views"), "{message}");
     }

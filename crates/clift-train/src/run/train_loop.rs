@@ -315,10 +315,10 @@ impl TrainLoop<'_> {
         })?;
         if has_result {
             self.progress.validated = step;
-            let is_updated = ranks.is_root() && self.is_checkpoint_due();
-            return if is_updated { self.checkpoints.update(&self.progress) } else { Ok(()) };
+            let has_checkpoint = ranks.is_root() && self.is_checkpoint_due();
+            return if has_checkpoint { self.checkpoints.update(&self.progress) } else { Ok(()) };
         }
-        // A resumed run validates again.
+        // Without a result, a resumed run validates again.
         if ranks.any(self.stop.load(Ordering::Relaxed))? {
             if self.saved < step {
                 self.save(train_state)?;

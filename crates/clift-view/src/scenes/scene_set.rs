@@ -105,7 +105,7 @@ impl RunScenes {
         let num_members = Contexts::choose(&self.reader, *index, &options)?.num_members();
         let num_tokens = self.model.config.num_tokens(num_members, height, width)?;
         let counts = self.storage_counts(num_tokens);
-        // Without a request, the count nearest to that of `clift encode`, a quarter.
+        // Without a request, the count nearest to a quarter.
         let wanted = request.stored.unwrap_or(num_tokens / 4);
         let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_tokens);
         let options = EncodeOptions { stored_tokens: Some(TokenCount::Count(stored)), ..options };

@@ -57,9 +57,9 @@ pub struct EncodeArgs {
     /// Leave one of N photos out, and compare it with its rendering
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = parse_hold_out)]
     pub hold_out: usize,
-    /// Tokens to store, as a number or a share [default: 1/4, of photos in groups 1/2]
+    /// Tokens to store, as a number or a share [default: 1/4, of several groups 1/2]
     ///
-    /// With many groups the default falls to 1/8. A number below 32 tokens a group makes fewer groups, which leave photos out.
+    /// Of many groups the default falls to 1/8. A number below 32 tokens a group makes fewer groups, which leave photos out.
     #[arg(long, value_name = "COUNT")]
     pub stored_tokens: Option<TokenCount>,
     /// Format of the tokens: f32, f16, coded or coded-DB [default: coded with a codec, else f16]

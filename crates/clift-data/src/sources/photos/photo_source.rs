@@ -290,8 +290,7 @@ impl SceneSource for PhotoSource {
 
     fn frame_with_coverage(&self, scene: usize, frame: usize) -> Result<(RgbImage, Option<RgbImage>), DataError> {
         let photo = self.photo(scene, frame)?;
-        let [width, height] = self.options.min_size;
-        let decode = || photo.decode(self.options.background, [width, height], self.key(scene), frame);
+        let decode = || photo.decode(self.options.background, self.options.min_size, self.key(scene), frame);
         let lock = || self.decoded.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(image) = lock().get(&(scene, frame)) {
             return Ok((image.clone(), None));
@@ -300,7 +299,7 @@ impl SceneSource for PhotoSource {
             return decode();
         }
         let (image, _) = decode()?;
-        let (width, height) = covering_size((image.width, image.height), (width, height));
+        let (width, height) = covering_size((image.width, image.height), self.options.min_size.into());
         if image.width * image.height < MIN_DECODED_RATIO * width * height || width * height == 0 {
             return Ok((image, None));
         }

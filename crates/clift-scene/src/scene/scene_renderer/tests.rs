@@ -134,7 +134,7 @@ fn middle(frame: &[f32], width: usize, columns: usize) -> Vec<f32> {
 #[test]
 fn frames_of_20_sizes_and_proportions_show_the_rendering_of_the_trained_size() {
     let device = Device::flex();
-    // The trained image has 24 x 16 pixels; sizes are height and width, in its proportions and in others.
+    // The trained image has 24 x 16 pixels; sizes are height and width, in its proportions, maybe rounded, and in others.
     let equal = [8, 12, 14, 16, 17, 20, 24, 32, 40, 48, 64, 128].map(|height: usize| [height, height * 3 / 2]);
     let others = [[31, 47], [16, 12], [40, 40], [64, 24], [16, 36], [24, 60], [32, 128], [48, 192]];
     for (encoding, grids) in [

@@ -1,13 +1,13 @@
 //! Table of the GPU adapters for `wgpu`, with the largest tensor of each.
 
 use clift_eval::table;
-use clift_model::{ADAPTER_VARIABLE, Adapter, adapters};
+use clift_model::{ADAPTER_VARIABLE, Adapter, DeviceName, adapters};
 
 use crate::output::units::memory_size;
 
-/// Formats the adapters, or the reason why there are none; `None` in a build without `wgpu`.
+/// Formats the adapters, or the reason why there are none; `None` in a build without GPUs.
 pub fn adapter_text() -> Option<String> {
-    if !cfg!(feature = "wgsl") {
+    if !DeviceName::Wgpu.is_built() {
         return None;
     }
     // Drivers may panic.
