@@ -27,7 +27,8 @@ impl<'a> SourceText<'a> {
         Self { files, texts }
     }
 
-    /// Returns the overrides, each with its start and behind as many blanks, which shift its spans behind those of the file.
+    /// Returns the offset and the text of each override. The text is padded with as many spaces, so that its spans follow those
+    /// of the file.
     pub(crate) fn padded_overrides(&self) -> Vec<(usize, String)> {
         self.texts[1..].iter().map(|(start, text)| (*start, format!("{}{text}", " ".repeat(*start)))).collect()
     }

@@ -66,8 +66,8 @@ impl<'a> Validation<'a> {
     }
 
     /// Measures a model without autodiff during training: with all tokens in stage 1, with one count of condensed tokens in
-    /// stage 2. Writes the first contact sheet to `folder`. Returns whether there is a finite PSNR: there is
-    /// none if no view could be measured, or if `stop` is set.
+    /// stage 2. Writes the first contact sheet to `folder`. Returns whether there is a finite PSNR:
+    /// there is none if no view could be measured, or if `stop` is set.
     pub fn validate(
         &self,
         model: &Network,

@@ -25,7 +25,7 @@ pub(crate) const CHUNKS_PER_CALL: usize = 64;
 /// Progress callback of a scan: numbers of examined chunks, and of all.
 pub type ScanProgress<'a> = &'a mut dyn FnMut(usize, usize);
 
-/// What is odd in a scene, for the notes of a report.
+/// Peculiarities of a scene that the report notes.
 pub(crate) const ODDITIES: [&str; 3] = [
     "without time stamps as int64: frames count 0, 1, ..",
     "with scaled rotations, whose scale was divided out",

@@ -182,12 +182,11 @@ impl<'a> Frame<'a> {
         Ok(Some([width, height]))
     }
 
-    /// Guesses the size of the calibrated images from the principal point, which is near their centre; `None` if it does not
-    /// decide. Also returns whether the stored image is smaller.
+    /// Guesses the size of the images that were calibrated, from the principal point, which is near their centre. Returns
+    /// `None` if there is no principal point or it decides nothing, and whether the calibrated images were much larger.
     ///
-    /// `[width, height]` is the size of the stored image, `assumed` that of the pixels in which the poses were computed. If the
-    /// EXIF orientation `exchanges` the sides, the size may be that of the turned image. A calibration of much larger images is
-    /// taken to have the nearest multiple of the size.
+    /// `[width, height]` is the size of the stored image, and `assumed` the size at which the poses were computed. The guess may
+    /// be the size of the rotated image if the EXIF orientation `exchanges` its sides. Of much larger images it is a multiple.
     fn guessed_size(
         &self,
         [width, height]: [f64; 2],

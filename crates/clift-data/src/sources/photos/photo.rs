@@ -81,8 +81,8 @@ pub(crate) struct Photo {
     pub poses_from: PosesFrom,
 }
 
-/// How a photo is turned by its EXIF orientation. Some tools turn photos before they compute cameras; others, such as COLMAP,
-/// compute them from the stored pixels.
+/// How a photo is rotated according to its EXIF orientation. Some tools rotate photos before they compute the cameras; others,
+/// such as COLMAP, use the stored pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Turn {
     /// Turns the pixels alone, to those of the camera.

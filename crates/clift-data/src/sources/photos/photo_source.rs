@@ -38,7 +38,7 @@ const COUNTED: [&str; 6] = [
 
 /// Largest size of the decoded photos in memory, in bytes.
 const MAX_DECODED_BYTES: usize = 1 << 30;
-/// Photos are kept in memory if they have this many times the pixels of the scaled image.
+/// Photos are kept in memory if they have at least this many times the pixels of the scaled image.
 const MIN_DECODED_RATIO: usize = 4;
 
 /// Largest number of scenes, and of bytes of the images of a scene, whose JPEG files are read to find damage.
