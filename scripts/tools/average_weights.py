@@ -19,6 +19,11 @@ def main():
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args()
+    missing = [folder / "model.safetensors" for folder in args.folders if not (folder / "model.safetensors").is_file()]
+    if missing:
+        parser.error(f"{missing[0]} is missing: give folders of a stage (runs/NAME/stage1) or of a model")
+    if args.out.exists():
+        parser.error(f"{args.out} exists: give a new folder")
     first, *others = [load_file(folder / "model.safetensors") for folder in args.folders]
     mean = {}
     for name, values in first.items():

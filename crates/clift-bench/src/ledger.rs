@@ -3,13 +3,60 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clift_core::BadConfig;
-use clift_model::{DeviceName, KernelLaunches, Precision, observe_kernels, reserved_bytes, used_adapter};
+use clift_model::{
+    DeviceName, KernelLaunches, Precision, names, observe_kernels, parse_variant, reserved_bytes, used_adapter,
+};
 use clift_train::{Config, TrainError};
 use serde::Serialize;
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::cases::case::BenchCase;
 use crate::cases::context::{BenchContext, BenchOptions};
 use crate::runner::prepare;
+
+/// A card with published limits, for [`Card::bound_s`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Display, IntoStaticStr, Serialize, VariantArray)]
+#[serde(into = "&'static str")]
+#[strum(serialize_all = "lowercase")]
+pub enum Card {
+    /// NVIDIA H100 SXM.
+    H100,
+    /// NVIDIA RTX 4090.
+    #[strum(serialize = "4090")]
+    Rtx4090,
+    /// Apple M3 Max with 40 cores.
+    M3Max,
+}
+
+impl Card {
+    /// Returns memory bandwidth in TB/s, and TFLOP/s of multiply-adds in f32 and of matrices in f16 with f32 sums, as
+    /// published by the vendors; the M3 Max has no matrix instructions.
+    fn limits(self) -> [f64; 3] {
+        match self {
+            Self::H100 => [3.35, 67.0, 989.0],
+            Self::Rtx4090 => [1.008, 82.6, 165.0],
+            Self::M3Max => [0.4, 14.0, 14.0],
+        }
+    }
+
+    /// Returns the least time that the card needs for the launches of a kernel: the larger of bytes over bandwidth, each buffer
+    /// moved once, and operations over rate. 0 for kernels of Burn.
+    pub fn bound_s(self, kernel: &KernelLaunches) -> f64 {
+        let [bandwidth, multiply_adds, matrices] = self.limits();
+        let rate = if kernel.kernel.contains("::matrix_") { matrices } else { multiply_adds };
+        let [move_s, compute_s] =
+            [(kernel.bytes.unwrap_or(0), bandwidth), (kernel.flops, rate)].map(|(n, tera)| n as f64 / tera / 1e12);
+        move_s.max(compute_s)
+    }
+}
+
+impl std::str::FromStr for Card {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        parse_variant(name).ok_or_else(|| format!("use one of {}", names::<Self>()))
+    }
+}
 
 /// The kernels of every case.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -44,6 +91,11 @@ impl LedgerRow {
     /// Returns the bytes of the kernels that tell them.
     pub fn bytes(&self) -> u64 {
         self.kernels.iter().filter_map(|kernel| kernel.bytes).sum()
+    }
+
+    /// Returns the floating-point operations of matrix products and attention.
+    pub fn flops(&self) -> u64 {
+        self.kernels.iter().map(|kernel| kernel.flops).sum()
     }
 
     /// Returns the time on the device; `None` if a kernel has none.

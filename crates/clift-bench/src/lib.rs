@@ -10,7 +10,7 @@ pub use cases::case::BenchCase;
 pub use cases::context::{BenchOptions, MAX_CHECKED_TOKENS};
 pub use runner::{BenchReport, BenchRow, run_bench};
 // Kernels of the parts on a GPU
-pub use ledger::{Ledger, LedgerRow, run_ledger};
+pub use ledger::{Card, Ledger, LedgerRow, run_ledger};
 // Devices and numerical stability
 pub use doctor::probe::{DeviceCheck, catch_panic, probe};
 pub use doctor::stability::case::{CaseSize, StabilityCase, StabilityRow};

@@ -12,11 +12,19 @@ use cubecl::logging::{LaunchObservation, LaunchObserver, ProfileDuration, Timing
 thread_local! {
     /// Bytes of the arguments of this thread's next launch.
     static ARGUMENTS: Cell<u64> = const { Cell::new(0) };
+    /// Floating-point operations of its products.
+    static PRODUCTS: Cell<u64> = const { Cell::new(0) };
 }
 
 /// Counts the bytes of an argument of a kernel of this crate, for its launch.
 pub(crate) fn count_argument(bytes: usize) {
     ARGUMENTS.set(ARGUMENTS.get() + bytes as u64);
+}
+
+/// Counts `count` products of `[rows, terms]` by `[terms, columns]` in the next launch of a kernel of this crate.
+pub(crate) fn count_products(count: usize, sizes: [usize; 3]) {
+    let multiply_adds = (count as u64) * sizes.map(|size| size as u64).iter().product::<u64>();
+    PRODUCTS.set(PRODUCTS.get() + 2 * multiply_adds);
 }
 
 /// A launch of a kernel.
@@ -26,6 +34,8 @@ pub struct Launch {
     pub kernel: &'static str,
     /// Bytes of the buffers that are its arguments, each once; 0 for kernels of other crates.
     pub bytes: u64,
+    /// Floating-point operations of its matrix products; 0 for kernels of other crates.
+    pub flops: u64,
     /// Time on the device; `None` without timestamps.
     pub seconds: Option<f64>,
 }
@@ -43,7 +53,7 @@ impl Observer {
 
 impl LaunchObserver for Observer {
     fn launched(&self, kernel: &'static str) {
-        let launch = Launch { kernel, bytes: ARGUMENTS.take(), seconds: None };
+        let launch = Launch { kernel, bytes: ARGUMENTS.take(), flops: PRODUCTS.take(), seconds: None };
         self.with(|launches| launches.push((launch, None)));
     }
 
@@ -67,6 +77,7 @@ pub fn observe<T>(is_timed: bool, run: impl FnOnce() -> T) -> (T, Vec<Launch>) {
     let observer = Arc::new(Observer { launches: Mutex::default(), timing });
     let dry_run = (!is_timed).then(DryRun::new);
     ARGUMENTS.set(0);
+    PRODUCTS.set(0);
     let observing = LaunchObservation::new(Arc::<Observer>::clone(&observer));
     let result = run();
     drop(observing);

@@ -50,7 +50,7 @@ mod weights;
 
 // Errors, and enums by name
 pub use error::ModelError;
-pub use names::{parse_value, parse_variant};
+pub use names::{names, parse_value, parse_variant};
 // Devices
 pub use clift_kernels::InstructionSet;
 pub use device::adapter::{ADAPTER_VARIABLE, Adapter, adapters, max_tensor_bytes, product_instructions, used_adapter};

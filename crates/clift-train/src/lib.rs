@@ -57,7 +57,7 @@ pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{BatchTokens, StageBatch};
 pub use step::device_batch::{DeviceBatch, render_loss};
-pub use step::loss::{Loss, LossParts, Rendering, mse};
+pub use step::loss::{Loss, LossParts, Rendering};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::StageOptimizer;
 pub use step::schedule::learning_rate;

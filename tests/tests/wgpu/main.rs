@@ -15,7 +15,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use burn::tensor::{DType, Device, Tensor};
 use clift_bench::{BenchCase, BenchOptions, CaseSize, run_bench, run_ledger, run_stability, stability_markdown};
-use clift_model::{DeviceName, Precision, TokenCount, adapters, max_tensor_bytes, observe_kernels};
+use clift_model::{DeviceName, FlopConvention, Precision, TokenCount, adapters, max_tensor_bytes, observe_kernels};
 use clift_scene::Scene;
 use clift_train::{Config, read_config};
 
@@ -111,8 +111,34 @@ fn updates_launch_few_kernels_and_only_own_products() {
         assert_eq!(products.count(), 0, "{of_burn:?}");
         assert!(kernels.clone().any(|(name, _, bytes)| name.starts_with("attention") && bytes > Some(0)));
     }
+    let Config { model, data, .. } = config(&set);
+    let macs = model.encode_macs(data.views.max_context, data.height, data.width).expect("valid sizes");
+    assert_eq!(ledger.rows[0].flops(), 2 * macs.count(FlopConvention::Macs), "the operations of encoding");
     let [encode, update] = [0, 1].map(|i| ledger.rows[i].count());
     assert!((60..300).contains(&encode) && (600..=1200).contains(&update), "{encode}, {update}");
+}
+
+#[test]
+fn a_killed_run_ends_with_the_same_bytes() {
+    let Some((_, _guard)) = gpu() else { return };
+    let place = Place::new();
+    for precision in ["precision='f32'", "precision='f16'"] {
+        let [whole, parts] = ["whole --fresh", "parts --fresh"];
+        let train = |binary: &str, moment: Option<&str>, words: &str| {
+            // `Place::train` hides the adapter.
+            let args = place.train_args(words, &["device='wgpu'", precision]);
+            Command::new(binary).args(moment).args(args).status().expect("it starts").code()
+        };
+        assert_eq!(train(BINARY, None, whole), Some(0));
+        let killed = env!("CARGO_BIN_EXE_clift-killed");
+        for (moment, words) in [("step/stage1/3", parts), ("saved/stage2/2", "parts")] {
+            assert_eq!(train(killed, Some(moment), words), None, "{moment}");
+        }
+        assert_eq!(train(BINARY, None, "parts"), Some(0));
+        for stage in ["stage1", "stage2"] {
+            assert!(place.weights("whole", stage) == place.weights("parts", stage), "{precision}: {stage}");
+        }
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Names of the rows, the same on the command line, in the JSON and in the PyTorch comparison.
 
+use clift_model::{names, parse_variant};
 use serde::Serialize;
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -36,11 +37,6 @@ impl BenchCase {
         self.into()
     }
 
-    /// Returns all names, joined by commas.
-    pub fn names() -> String {
-        Self::ALL.iter().map(|case| case.name()).collect::<Vec<_>>().join(", ")
-    }
-
     /// Whether the case clusters or condenses tokens.
     pub const fn needs_clusters(self) -> bool {
         !matches!(self, Self::Encode | Self::Render | Self::Render8Views | Self::Stage1Step)
@@ -56,7 +52,6 @@ impl std::str::FromStr for BenchCase {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let found = Self::ALL.iter().find(|case| case.name() == name.trim()).copied();
-        found.ok_or_else(|| format!("unknown; the cases are {}", Self::names()))
+        parse_variant(name.trim()).ok_or_else(|| format!("unknown; the cases are {}", names::<Self>()))
     }
 }

@@ -9,6 +9,7 @@ use crate::attention::register_attention as register;
 use crate::attention::register_scores::{ROWS, UNITS};
 use crate::buffers::buffer::{Buffer, Values};
 use crate::buffers::elementwise::cast;
+use crate::ledger::count_products;
 
 /// Sizes of an attention.
 #[derive(Clone, Copy, Debug)]
@@ -45,6 +46,11 @@ impl AttentionSizes {
 
     fn cubes(self, count: usize, rows: usize) -> CubeCount {
         CubeCount::Static(count.div_ceil(rows) as u32, (self.batch * self.num_heads) as u32, 1)
+    }
+
+    /// Counts products of the size of the scores in the next launch.
+    fn count_products(self, count: usize) {
+        count_products(count * self.batch * self.num_heads, [self.num_queries, self.num_keys, self.head_width]);
     }
 
     /// Returns the width of vectors, 4 if it divides heads and rows, and 1 otherwise.
@@ -107,6 +113,7 @@ pub fn attention_forward(client: &Client, sizes: AttentionSizes, inputs: [HeadRo
     let (vector, elem) = (sizes.vector(&[query, key, value, to]), query.buffer.values.elem());
     let [q, k, v, out] = [query, key, value, to].map(|rows| rows.buffer.arg(vector));
     let (logs, at) = (log_sum.arg(1), attention(sizes, [query, key, value, to]));
+    sizes.count_products(2);
     // SAFETY: the kernels read and write inside the counts of the rows.
     unsafe {
         launch!(tile, forward, client, sizes, num_queries, vector, [q, k, v, out, logs, at], elem);
@@ -166,6 +173,8 @@ pub fn attention_backward(
         let [q, k, v, g] = [query, key, value, grad].map(|rows| rows.buffer.arg(vector));
         let [logs, deltas] = [log_sum, &delta].map(|x| x.arg(1));
         let at = attention(sizes, [query, key, value, grad]);
+        // The scores again and the gradients of the weights; then those of the queries, or of keys and values.
+        sizes.count_products(if of_keys { 4 } else { 3 });
         // SAFETY: the kernels read and write inside the counts of the rows.
         unsafe {
             if of_keys {

@@ -6,6 +6,7 @@ use cubecl::prelude::*;
 
 use crate::buffers::buffer::{Buffer, Matrices, Values};
 use crate::buffers::load::{Four, LinesLaunch};
+use crate::ledger::count_products;
 use crate::products::epilogue::{Epilogue, write_four};
 use crate::products::matrix_product::matrix_product;
 use crate::products::product_kind::{ProductKind, SizesLaunch};
@@ -87,6 +88,7 @@ impl<'a> Product<'a> {
 
     fn launch(&self, client: &Client, tile: ProductTile, splits: Splits, epilogue: Epilogue, output: &Buffer) {
         let [m, n, k] = self.sizes;
+        count_products(self.batch, [m, n, k]);
         let kind = ProductKind { terms_inner: [!self.lhs.transposed, self.rhs.transposed], epilogue };
         let [lhs_width, rhs_width] = [self.lhs.width([m, k]), self.rhs.width([k, n])];
         let output_width = if n.is_multiple_of(4) { 4 } else { 1 };

@@ -12,6 +12,8 @@ pub struct KernelLaunches {
     pub count: usize,
     /// Bytes of the buffers that the launches read and write, each counted once; `None` for kernels of Burn, which do not tell.
     pub bytes: Option<u64>,
+    /// Floating-point operations of matrix products and attention; 0 for kernels of Burn.
+    pub flops: u64,
     /// Time on the device; `None` if the launches were dropped, and without timestamps.
     pub seconds: Option<f64>,
 }
@@ -29,9 +31,11 @@ pub fn observe_kernels<T>(is_timed: bool, run: impl FnOnce() -> T) -> (T, Vec<Ke
             kernel: name.clone(),
             count: 0,
             bytes: (!name.starts_with("burn")).then_some(0),
+            flops: 0,
             seconds: Some(0.0),
         });
         entry.count += 1;
+        entry.flops += launch.flops;
         entry.bytes = entry.bytes.map(|sum| sum + launch.bytes);
         entry.seconds = entry.seconds.zip(launch.seconds).map(|(sum, seconds)| sum + seconds);
     }

@@ -49,14 +49,17 @@ pub fn rays(cameras: &Cameras, frame: RayFrame) -> Tensor<5> {
 pub fn plucker(cameras: &Cameras) -> Tensor<5> {
     let [batch, views] = cameras.dims();
     let (height, width) = (cameras.height, cameras.width);
+    let pose = |rows: usize, columns: std::ops::Range<usize>| {
+        cameras.c2w.clone().slice([0..batch, 0..views, rows..rows + 1, columns])
+    };
+    let [direction, origin] = [0..3, 3..4].map(|columns| [0, 1, 2].map(|row| pose(row, columns.clone())));
+    // Both are linear in the direction in the camera's frame; a row of the moment is one of `origin x rotation`.
+    let moment =
+        |i: usize, j: usize| origin[i].clone() * direction[j].clone() - origin[j].clone() * direction[i].clone();
+    let to_ray = Tensor::cat([vec![moment(1, 2), moment(2, 0), moment(0, 1)], direction.to_vec()].concat(), 2);
     let camera_ray = camera_rays(cameras).reshape([batch, views, height * width, 3]);
-
-    let rotation = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 0..3]);
-    let direction = matmul_without_gradient(camera_ray, rotation.swap_dims(2, 3));
-    let direction = direction.reshape([batch, views, height, width, 3]);
-    let origin = cameras.c2w.clone().slice([0..batch, 0..views, 0..3, 3..4]);
-    let origin = origin.reshape([batch, views, 1, 1, 3]).expand([batch, views, height, width, 3]);
-    Tensor::cat(vec![cross(origin, direction.clone()), direction], 4)
+    let rays = matmul_without_gradient(camera_ray, to_ray.swap_dims(2, 3));
+    rays.reshape([batch, views, height, width, 6])
 }
 
 /// Computes the unit direction of every pixel's ray in the frame of its camera.
@@ -67,7 +70,6 @@ fn camera_rays(cameras: &Cameras) -> Tensor<5> {
     let [batch, views] = cameras.dims();
     let (height, width) = (cameras.height, cameras.width);
     assert_shape!(cameras.intrinsics, [batch, views, 4]);
-    let grid = [batch, views, height, width, 1];
 
     let intrinsic = |index: usize| cameras.intrinsics.clone().narrow(2, index, 1).reshape([batch, views, 1, 1, 1]);
     let [fx, fy, cx, cy] = [0, 1, 2, 3].map(intrinsic);
@@ -76,19 +78,15 @@ fn camera_rays(cameras: &Cameras) -> Tensor<5> {
     let centers = |count: usize, shape: [usize; 5]| {
         Tensor::<1, Int>::arange(0..count as i64, &device).float().cast(dtype).add_scalar(0.5).reshape(shape)
     };
-    let x = ((centers(width, [1, 1, 1, width, 1]) - cx) / fx).expand(grid);
-    let y = ((centers(height, [1, 1, height, 1, 1]) - cy) / fy).expand(grid);
-    let z = x.ones_like();
+    let x = (centers(width, [1, 1, 1, width, 1]) - cx) / fx;
+    let y = (centers(height, [1, 1, height, 1, 1]) - cy) / fy;
+    let unit = |axis: usize| {
+        let ones = [0, 1, 2].map(|other| f32::from(u8::from(other == axis)));
+        Tensor::<1>::from_floats(ones, &device).cast(dtype).reshape([1, 1, 1, 1, 3])
+    };
     // The third coordinate is 1, so that the length is at least 1.
-    let camera_ray = Tensor::cat(vec![x, y, z], 4);
-    let length = camera_ray.clone().square().sum_dim(4).sqrt();
-    camera_ray / length
-}
-
-fn cross(a: Tensor<5>, b: Tensor<5>) -> Tensor<5> {
-    let part = |t: &Tensor<5>, i: usize| t.clone().narrow(4, i, 1);
-    let component = |i: usize, j: usize| part(&a, i) * part(&b, j) - part(&a, j) * part(&b, i);
-    Tensor::cat(vec![component(1, 2), component(2, 0), component(0, 1)], 4)
+    let length = (x.clone().square() + y.clone().square()).add_scalar(1.0).sqrt();
+    (x * unit(0) + (y * unit(1) + unit(2))) / length
 }
 
 #[cfg(test)]

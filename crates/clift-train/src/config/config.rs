@@ -108,6 +108,9 @@ impl Config {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
+    /// Whether the mean over the target views of `0.01 ln(1 + MSE / 0.0001)` replaces the mean squared error: easy views
+    /// count as much as hard ones, as in a mean PSNR.
+    pub log_mse: bool,
     /// Weight of the perceptual term, 0.5 in the paper. 0: mean squared error only.
     pub perceptual_weight: f64,
     /// Weights of the VGG-19 network published by MatConvNet, converted by `scripts/tools/convert_vgg.py`.

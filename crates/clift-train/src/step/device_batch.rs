@@ -57,14 +57,14 @@ impl DeviceBatch {
         })
     }
 
-    /// Returns the loss of a rendering. Masked pixels are replaced by the target's, so that they add nothing, and the loss
-    /// is divided by the share of the others.
+    /// Returns the loss of a rendering. Masked pixels are replaced by the target's, so that they add nothing.
     fn loss(&self, loss: &Loss, rendering: Rendering) -> LossParts {
         let target = self.target_images.clone();
-        let Some(TargetWeights { values, mean }) = &self.target_weights else { return loss.of(&rendering, target) };
+        let Some(TargetWeights { values, mean }) = &self.target_weights else {
+            return loss.of(&rendering, target, 1.0);
+        };
         let images = target.clone() + (rendering.images - target.clone()) * values.clone();
-        let LossParts { total, mse } = loss.of(&Rendering { images, ..rendering }, target);
-        LossParts { total: total.div_scalar(*mean), mse: mse.div_scalar(*mean) }
+        loss.of(&Rendering { images, ..rendering }, target, *mean)
     }
 }
 

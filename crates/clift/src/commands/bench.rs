@@ -2,9 +2,11 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{BenchCase, BenchOptions, BenchReport, BenchRow, Ledger, MAX_CHECKED_TOKENS, run_bench, run_ledger};
+use clift_bench::{
+    BenchCase, BenchOptions, BenchReport, BenchRow, Card, Ledger, MAX_CHECKED_TOKENS, run_bench, run_ledger,
+};
 use clift_eval::table;
-use clift_model::{Precision, TokenCount};
+use clift_model::{KernelLaunches, Precision, TokenCount, names};
 
 use crate::commands::args::parse::parse_count;
 use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
@@ -27,7 +29,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         let ledger = run_ledger(&config, &options, &stop, &mut |row| {
             print_note(&format!("{}: {} launches", row.case, row.count()));
         })?;
-        print_result(&ledger_text(&ledger))?;
+        print_result(&ledger_text(&ledger, args.card))?;
         return json.write(&ledger);
     }
     let report = run_bench(&config, &options, &stop, &mut |row| {
@@ -76,26 +78,38 @@ fn cells(row: &BenchRow) -> [String; 5] {
     [row.case.to_string(), seconds(row.median_s), seconds(row.p95_s), memory, error]
 }
 
-fn ledger_text(ledger: &Ledger) -> String {
+fn ledger_text(ledger: &Ledger, card: Option<Card>) -> String {
     let Ledger { adapter, precision, is_timed, rows } = ledger;
     let run = if *is_timed { "" } else { "; compiled, not run" };
     let time = |value: Option<f64>| value.map_or_else(|| "-".into(), seconds);
+    let operations = |flops: u64| if flops == 0 { "-".into() } else { format!("{:.1}", flops as f64 / 1e9) };
     let tables = rows.iter().map(|row| {
-        let total = ["all".into(), row.count().to_string(), memory_size(row.bytes()), time(row.seconds())];
-        let cells = row.kernels.iter().map(|kernel| {
+        let bound =
+            |kernels: &[KernelLaunches]| card.map(|card| kernels.iter().map(|kernel| card.bound_s(kernel)).sum());
+        let cells = |name: &str, count: usize, bytes: String, flops, times: [Option<f64>; 2]| {
+            let [on_device, bound] = times.map(time);
+            [name.into(), count.to_string(), bytes, operations(flops), on_device, bound]
+        };
+        let times = [row.seconds(), bound(&row.kernels)];
+        let total = cells("all", row.count(), memory_size(row.bytes()), row.flops(), times);
+        let kernels = row.kernels.iter().map(|kernel| {
             let bytes = kernel.bytes.map_or_else(|| "-".into(), memory_size);
-            [kernel.kernel.clone(), kernel.count.to_string(), bytes, time(kernel.seconds)]
+            let times = [kernel.seconds, bound(std::slice::from_ref(kernel)).filter(|bound| *bound > 0.0)];
+            cells(&kernel.kernel, kernel.count, bytes, kernel.flops, times)
         });
         let reserved = row.reserved_bytes.map_or_else(|| "unknown".into(), memory_size);
-        let header = ["kernel", "launches", "bytes", "time"];
-        format!("\n{} ({reserved} of memory held)\n\n{}", row.case, table(header, [total].into_iter().chain(cells)))
+        let header = ["kernel", "launches", "bytes", "GFLOP", "time", "least time"];
+        format!("\n{} ({reserved} of memory held)\n\n{}", row.case, table(header, [total].into_iter().chain(kernels)))
     });
     let title = format!("{adapter}, {precision} products{run}\nbytes of the buffers of all launches, without Burn's");
-    [title].into_iter().chain(tables).collect::<Vec<_>>().join("\n")
+    let projection = card.map(|card| {
+        format!("least time: a projection for {card}: bytes over its bandwidth or GFLOP over its rate, without Burn's kernels")
+    });
+    [title].into_iter().chain(projection).chain(tables).collect::<Vec<_>>().join("\n")
 }
 
 #[derive(Debug, clap::Args)]
-#[command(after_help = format!("Cases:\n  {}", BenchCase::names()))]
+#[command(after_help = format!("Cases:\n  {}", names::<BenchCase>()))]
 pub struct BenchArgs {
     /// Config file (TOML) with the sizes to time
     pub config: PathBuf,
@@ -121,6 +135,9 @@ pub struct BenchArgs {
     /// List the kernels that the cases launch on a GPU, with their time on the device (not on a software adapter)
     #[arg(long, conflicts_with_all = ["repeats", "no_error"])]
     pub ledger: bool,
+    /// Print the least time of the kernels on a card, from its published bandwidth and rates: h100, 4090 or m3max
+    #[arg(long, requires = "ledger", value_name = "CARD")]
+    pub card: Option<Card>,
 }
 
 #[cfg(test)]
