@@ -110,7 +110,7 @@ mod tests {
             let expected = views.map(|(_, mse)| 0.01 * (1.0 + mse / 1e-4).ln()).iter().sum::<f64>() / 2.0;
             let [total, mse] = [total, mse].map(|value| f64::from(value.into_scalar::<f32>()));
             assert!((total - expected).abs() < 1e-7 && (mse - 0.13 / share).abs() < 1e-6, "{total}, {mse}");
-            let grads: Vec<f32> = grads.into_data().to_vec().expect("f32");
+            let grads: Vec<f32> = grads.into_data().try_to_vec().expect("f32");
             for ((error, mse), grads) in views.iter().zip(grads.chunks(48)) {
                 let expected = 0.01 / (1e-4 + mse) * 2.0 * error / share / 96.0;
                 assert!(
