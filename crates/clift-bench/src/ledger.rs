@@ -14,7 +14,7 @@ use crate::cases::case::BenchCase;
 use crate::cases::context::{BenchContext, BenchOptions};
 use crate::runner::prepare;
 
-/// A card with published limits, for [`Card::bound_s`].
+/// A card, for [`Card::bound_s`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Display, IntoStaticStr, Serialize, VariantArray)]
 #[serde(into = "&'static str")]
 #[strum(serialize_all = "lowercase")]
@@ -29,8 +29,9 @@ pub enum Card {
 }
 
 impl Card {
-    /// Returns memory bandwidth in TB/s, and TFLOP/s of multiply-adds in f32 and of matrices in f16 with f32 sums, as
-    /// published by the vendors; the M3 Max has no matrix instructions.
+    /// Returns memory bandwidth in TB/s, and TFLOP/s of multiply-adds in f32 and of matrices in f16 with f32 sums, from the
+    /// vendors' data sheets. Apple names the bandwidth only: 14 is 40 cores of 128 multiply-adds at 1.4 GHz; the M3 Max has no
+    /// matrix instructions.
     fn limits(self) -> [f64; 3] {
         match self {
             Self::H100 => [3.35, 67.0, 989.0],

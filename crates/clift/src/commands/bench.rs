@@ -135,7 +135,7 @@ pub struct BenchArgs {
     /// List the kernels that the cases launch on a GPU, with their time on the device (not on a software adapter)
     #[arg(long, conflicts_with_all = ["repeats", "no_error"])]
     pub ledger: bool,
-    /// Print the least time of the kernels on a card, from its published bandwidth and rates: h100, 4090 or m3max
+    /// Print the least time of the kernels on a card, from its bandwidth and arithmetic rate: h100, 4090 or m3max
     #[arg(long, requires = "ledger", value_name = "CARD")]
     pub card: Option<Card>,
 }
