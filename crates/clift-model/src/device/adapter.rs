@@ -38,18 +38,22 @@ pub fn max_tensor_bytes(device: &Device) -> Option<u64> {
     }
 }
 
-/// Says by which instructions an open GPU multiplies matrices in f32 and f16; `None` for a CPU.
+/// Says to which language kernels are compiled for an open GPU and by which instructions they multiply matrices in f32 and
+/// f16; `None` for a CPU.
 #[cfg(feature = "wgpu")]
 pub fn product_instructions(device: &Device) -> Option<String> {
     use clift_cube::{AdapterClass, MatrixShape};
     let device = device.clone().without_autodiff();
     let burn::backend::DispatchDevice::Cube(device) = device.as_dispatch() else { return None };
-    Some(match AdapterClass::of(&device.client()) {
+    let is_vulkan = used_adapter().is_some_and(|adapter| adapter.api == "Vulkan");
+    let language = if cfg!(feature = "spirv") && is_vulkan { "SPIR-V" } else { "WGSL" };
+    let products = match AdapterClass::of(&device.client()) {
         AdapterClass::Matrices(MatrixShape { sizes: [m, n, k], plane }) => format!(
             "f32 by multiply-adds; f16 by cooperative matrices of {m} x {n} x {k} in subgroups of {plane}, with f32 sums"
         ),
         AdapterClass::Registers => "no cooperative matrices: f32, also with precision = \"f16\"".into(),
-    })
+    };
+    Some(format!("kernels in {language}; {products}"))
 }
 
 /// Returns nothing: this build does not contain the device `wgpu`.

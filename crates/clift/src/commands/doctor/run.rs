@@ -27,7 +27,7 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
         print_result(&format!("{adapters}\n"))?;
         // The table says why a device cannot be opened.
         if let Some(text) = DeviceName::Wgpu.open().ok().as_ref().and_then(product_instructions) {
-            print_result(&format!("products of wgpu: {text}\n"))?;
+            print_result(&format!("wgpu: {text}\n"))?;
         }
     }
     let default = DeviceName::default();
