@@ -94,7 +94,7 @@ impl LedgerRow {
         self.kernels.iter().filter_map(|kernel| kernel.bytes).sum()
     }
 
-    /// Returns the floating-point operations of matrix products and attention.
+    /// Returns the floating-point operations that the kernels count.
     pub fn flops(&self) -> u64 {
         self.kernels.iter().map(|kernel| kernel.flops).sum()
     }

@@ -32,11 +32,6 @@ impl BenchCase {
     /// All cases, in the order they run.
     pub const ALL: &'static [Self] = Self::VARIANTS;
 
-    /// Returns the name that is typed and written.
-    pub fn name(self) -> &'static str {
-        self.into()
-    }
-
     /// Whether the case clusters or condenses tokens.
     pub const fn needs_clusters(self) -> bool {
         !matches!(self, Self::Encode | Self::Render | Self::Render8Views | Self::Stage1Step)

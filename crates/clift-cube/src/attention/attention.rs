@@ -173,7 +173,8 @@ pub fn attention_backward(
         let [q, k, v, g] = [query, key, value, grad].map(|rows| rows.buffer.arg(vector));
         let [logs, deltas] = [log_sum, &delta].map(|x| x.arg(1));
         let at = attention(sizes, [query, key, value, grad]);
-        // The scores again and the gradients of the weights; then those of the queries, or of keys and values.
+        // Two products give the scores and the gradients of the weights. Another gives the gradients of the queries, or two
+        // give those of keys and values.
         sizes.count_products(if of_keys { 4 } else { 3 });
         // SAFETY: the kernels read and write inside the counts of the rows.
         unsafe {

@@ -12,7 +12,7 @@ pub struct KernelLaunches {
     pub count: usize,
     /// Bytes of the buffers that the launches read and write, each counted once; `None` for kernels of Burn, which do not tell.
     pub bytes: Option<u64>,
-    /// Floating-point operations of matrix products and attention; 0 for kernels of Burn.
+    /// Floating-point operations of matrix products and attention, without attention inside clusters; 0 for kernels of Burn.
     pub flops: u64,
     /// Time on the device; `None` if the launches were dropped, and without timestamps.
     pub seconds: Option<f64>,

@@ -52,11 +52,11 @@ pub fn plucker(cameras: &Cameras) -> Tensor<5> {
     let pose = |rows: usize, columns: std::ops::Range<usize>| {
         cameras.c2w.clone().slice([0..batch, 0..views, rows..rows + 1, columns])
     };
-    let [direction, origin] = [0..3, 3..4].map(|columns| [0, 1, 2].map(|row| pose(row, columns.clone())));
-    // Both are linear in the direction in the camera's frame; a row of the moment is one of `origin x rotation`.
-    let moment =
-        |i: usize, j: usize| origin[i].clone() * direction[j].clone() - origin[j].clone() * direction[i].clone();
-    let to_ray = Tensor::cat([vec![moment(1, 2), moment(2, 0), moment(0, 1)], direction.to_vec()].concat(), 2);
+    let [rotation, origin] = [0..3, 3..4].map(|columns| [0, 1, 2].map(|row| pose(row, columns.clone())));
+    // Moment and direction are products of a matrix and the direction in the frame of the camera: `origin x rotation` and
+    // `rotation`. `moment` returns a row of the first.
+    let moment = |i: usize, j: usize| origin[i].clone() * rotation[j].clone() - origin[j].clone() * rotation[i].clone();
+    let to_ray = Tensor::cat([vec![moment(1, 2), moment(2, 0), moment(0, 1)], rotation.to_vec()].concat(), 2);
     let camera_ray = camera_rays(cameras).reshape([batch, views, height * width, 3]);
     let rays = matmul_without_gradient(camera_ray, to_ray.swap_dims(2, 3));
     rays.reshape([batch, views, height, width, 6])

@@ -63,9 +63,9 @@ impl Loss {
     /// - `target`: `[batch, views, height, width, 3]` in `[0, 1]`
     /// - `share`: share of the pixels that are not masked, in `(0, 1]`
     pub fn of(&self, rendering: &Rendering, target: Tensor<5>, share: f64) -> LossParts {
-        let errors = (rendering.images.clone() - target.clone()).square().div_scalar(share);
-        let mse = errors.clone().mean();
-        let pixels = if self.is_log { mean_logarithm(errors) } else { mse.clone() };
+        let errors = (rendering.images.clone() - target.clone()).square();
+        let mse = errors.clone().mean().div_scalar(share);
+        let pixels = if self.is_log { mean_logarithm(errors, share) } else { mse.clone() };
         let total = match &self.perceptual {
             Some((weight, network)) => {
                 pixels + network.forward(rendering.images.clone(), target).mul_scalar(*weight / share)
@@ -76,15 +76,15 @@ impl Loss {
     }
 }
 
-/// Averages `0.01 ln(1 + MSE / 0.0001)` over the views.
+/// Averages `0.01 ln(1 + MSE / 0.0001)` over the views, whose pixels are masked but for a `share`.
 ///
 /// # Shapes
-/// - `squared_errors`: `[batch, views, height, width, 3]`
+/// - `squared_errors`: `[batch, views, height, width, 3]`, 0 in masked pixels
 /// - returns a scalar, `[1]`
-fn mean_logarithm(squared_errors: Tensor<5>) -> Tensor<1> {
+fn mean_logarithm(squared_errors: Tensor<5>, share: f64) -> Tensor<1> {
     let [batch, views, height, width, 3] = squared_errors.dims() else { panic!("images have three channels") };
     let mse = squared_errors.reshape([batch * views, height * width * 3]).mean_dim(1);
-    mse.div_scalar(LOG_MSE).log1p().mean().mul_scalar(LOG_FACTOR)
+    mse.div_scalar(share * LOG_MSE).log1p().mean().mul_scalar(LOG_FACTOR)
 }
 
 #[cfg(test)]
@@ -108,6 +108,7 @@ mod tests {
             let grads = rendering.images.grad(&total.clone().backward()).expect("the images are tracked");
             let views = [0.1_f64, 0.5].map(|error| (error, error * error / share));
             let expected = views.map(|(_, mse)| 0.01 * (1.0 + mse / 1e-4).ln()).iter().sum::<f64>() / 2.0;
+            // A few roundings in f32.
             let [total, mse] = [total, mse].map(|value| f64::from(value.into_scalar::<f32>()));
             assert!((total - expected).abs() < 1e-7 && (mse - 0.13 / share).abs() < 1e-6, "{total}, {mse}");
             let grads: Vec<f32> = grads.into_data().try_to_vec().expect("f32");
