@@ -21,6 +21,11 @@ pub enum ModelError {
     BadRay { token: usize, origin: [f64; 3], direction: [f64; 3] },
     #[error("device `{name}`: {reason}")]
     NoDevice { name: String, reason: String },
+    #[error(
+        "{what} of {num_views} context views would be one tensor of {bytes} bytes, and the device takes at most {limit} in \
+         one: choose fewer context views"
+    )]
+    TensorTooLarge { what: String, bytes: u64, limit: u64, num_views: usize },
     #[error("reading values from the device failed: {reason}")]
     Device { reason: String },
     #[error("{reason}")]

@@ -107,6 +107,7 @@ fn code_of(error: &(dyn Error + 'static)) -> Option<u8> {
             | ModelError::NoCodec { .. }
             | ModelError::NoConfig { .. }
             | ModelError::NoDevice { .. }
+            | ModelError::TensorTooLarge { .. }
             | ModelError::NoModel { .. }
             | ModelError::NotDivisible { .. }
             | ModelError::NotImported { .. }

@@ -31,7 +31,7 @@ pub(crate) fn evaluate_scene(
     metrics: &mut EvalResults,
 ) -> Result<Option<SceneResults>, EvalError> {
     let device = &models.stage1.device;
-    let context = &Views::upload(&[&clip.context], device)?;
+    let context = &models.stage1.upload(&clip.context, &sweep.eval.stored_tokens)?;
     let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
     let scorer = &ViewScorer::new(clip, sweep.lpips.as_ref());
     let cameras = Cameras::upload(&[&clip.target], device)?;

@@ -5,13 +5,20 @@ use std::path::Path;
 use burn::module::Module;
 use burn::store::PathFilter;
 use burn::tensor::Device;
+use clift_core::ClipViews;
 
+use crate::cost::largest_tensor::{kmeans_values, largest_tensors};
 use crate::cost::parameters::Parameters;
+use crate::cost::scene_sizes::SceneSizes;
+use crate::device::adapter::max_tensor_bytes;
 use crate::error::ModelError;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
+use crate::network::layers::Part;
 use crate::network::model::{Network, is_condenser};
 use crate::network::renderer::Renderer;
+use crate::tokens::count::TokenCount;
+use crate::views::upload::Views;
 use crate::weights::file::{load_module, load_part};
 use crate::weights::hash::{renderer_hash, weights_hash};
 use crate::weights::model_path::{ModelPath, check_condenser, check_sizes};
@@ -57,6 +64,16 @@ impl TrainedModel {
         Self { config: config.clone(), network: network.clone(), has_condenser, device }
     }
 
+    /// Copies the context views of a scene to the device, of which one of `stored_tokens` is stored. Refuses views that take a
+    /// tensor larger than the device can hold.
+    pub fn upload(&self, context: &ClipViews, stored_tokens: &[TokenCount]) -> Result<Views, ModelError> {
+        if let Some(limit) = max_tensor_bytes(&self.device) {
+            let sizes = [context.num_views().max(1), context.height, context.width];
+            check_tensors(&self.config, sizes, stored_tokens, limit)?;
+        }
+        Views::upload(&[context], &self.device)
+    }
+
     /// Whether both models have equal encoders, as the two stages of a run must.
     pub fn has_encoder_of(&self, other: &Self) -> bool {
         weights_hash(&self.network.encoder) == weights_hash(&other.network.encoder)
@@ -70,6 +87,31 @@ impl TrainedModel {
     /// Returns the hash of weights, variant and heads of the renderer that scene files contain.
     pub fn renderer_hash(&self) -> String {
         renderer_hash(&self.network.renderer, &self.config)
+    }
+}
+
+/// Refuses context views whose encoding takes a tensor of more than `limit` bytes.
+fn check_tensors(
+    config: &ModelConfig,
+    [num_views, height, width]: [usize; 3],
+    stored_tokens: &[TokenCount],
+    limit: u64,
+) -> Result<(), ModelError> {
+    let sizes = SceneSizes::of(config, num_views, 1, [height, width])?;
+    let mut tensors = largest_tensors(config, Part::Encoder, &sizes, 1);
+    if config.architecture.supports_clusters() {
+        let counts = stored_tokens.iter().filter_map(|count| count.of(sizes.num_tokens).ok());
+        let num_stored = counts.max().unwrap_or_default();
+        let stored = SceneSizes { num_storage_tokens: Some(num_stored), ..sizes };
+        tensors.extend(largest_tensors(config, Part::Condenser, &stored, 1));
+        tensors.push(("the distances of K-means".into(), kmeans_values(sizes.num_tokens, num_stored)));
+    }
+    let bytes = |values: u64| values * size_of::<f32>() as u64;
+    match tensors.into_iter().max_by_key(|(_, values)| *values) {
+        Some((what, values)) if bytes(values) > limit => {
+            Err(ModelError::TensorTooLarge { what, bytes: bytes(values), limit, num_views })
+        }
+        _ => Ok(()),
     }
 }
 
@@ -89,4 +131,21 @@ pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Resu
         return Err(refuse(format!("{count} parameters of the scene's renderer are missing (renderer.{name})")));
     }
     Ok(renderer)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The paper's network: 1,024 tokens a view, queries, keys and values of 3 x 768 values.
+    #[test]
+    fn a_tensor_of_the_limit_fits_and_one_byte_less_does_not() {
+        let check = |num_views, limit| {
+            check_tensors(&ModelConfig::default(), [num_views, 256, 256], &[TokenCount::Count(64)], limit)
+        };
+        let bytes = 64 * 1024 * 3 * 768 * 4;
+        assert!(check(64, bytes).is_ok());
+        let message = check(64, bytes - 1).unwrap_err().to_string();
+        assert!(message.contains("64 context views") && message.contains(&bytes.to_string()), "{message}");
+    }
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use burn::tensor::Tensor;
 use clift_core::{derive_seed, item_rng, mean};
 use clift_data::{Clip, ClipReader, EvaluationItem};
-use clift_model::{Cameras, KMeans, ModelError, TokenCount, TokenKind, Tokens, TrainedModel, Views};
+use clift_model::{Cameras, KMeans, ModelError, TokenCount, TokenKind, Tokens, TrainedModel};
 use rand::RngExt;
 
 use crate::codec::histogram::Histograms;
@@ -146,7 +146,7 @@ impl Fit<'_> {
     }
 
     fn lift(&self, clip: &Clip) -> Result<Tokens, SceneError> {
-        Ok(self.model.network.encode(&Views::upload(&[&clip.context], &self.model.device)?))
+        Ok(self.model.network.encode(&self.model.upload(&clip.context, &self.options.counts)?))
     }
 
     /// Returns the stored tokens of a scene, `[S, D]`, at one of the counts, and their patches.

@@ -3,7 +3,7 @@
 
 use clift_core::{ClipViews, derive_seed};
 use clift_data::ClipReader;
-use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, Views};
+use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel};
 
 use crate::encode::contexts::{Contexts, EncodeOptions};
 use crate::error::SceneError;
@@ -77,7 +77,7 @@ pub fn encode(
 /// Returns the share of the tokens that is stored by default: a quarter of one group or half of several. Of many tokens, `MOST`
 /// are stored, which `models/rooms` codes in about 370 kB, or an eighth if that is more.
 fn default_share(num_tokens: usize, num_groups: usize) -> f64 {
-    const MOST: f64 = 7680.0;
+    const MOST: f64 = 7168.0;
     (MOST / num_tokens as f64).clamp(0.125, if num_groups == 1 { 0.25 } else { 0.5 })
 }
 
@@ -123,7 +123,7 @@ fn encode_group(
     options: &EncodeOptions,
     seed: u64,
 ) -> Result<(Vec<f32>, SceneClusters), SceneError> {
-    let lift = model.network.encode(&Views::upload(&[views], &model.device)?); // [1, N, D]
+    let lift = model.network.encode(&model.upload(views, &[TokenCount::Count(count)])?); // [1, N, D]
     let supports_clusters = model.config.architecture.supports_clusters();
     let clusters = if supports_clusters {
         let grid = [views.height, views.width].map(|side| side / model.config.patch_size);
@@ -162,7 +162,7 @@ mod tests {
         assert_eq!(counts(&[4, 1], Some(TokenCount::Count(30))).unwrap(), [15, 6], "no more than the group has");
         let shares = [(1024, 1), (40_000, 1), (2048, 2), (40_000, 40), (100_000, 90)]
             .map(|(all, groups)| default_share(all, groups));
-        assert_eq!(shares, [0.25, 0.192, 0.5, 0.192, 0.125]);
+        assert_eq!(shares, [0.25, 0.1792, 0.5, 0.1792, 0.125]);
         let message = counts(&[2, 2, 2], Some(TokenCount::Count(2))).unwrap_err();
         assert!(message.contains("the scene has 3 groups of views"), "{message}");
     }
