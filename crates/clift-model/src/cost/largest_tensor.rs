@@ -2,9 +2,11 @@
 //! `max_storage_buffer_binding_size` (below 2 GiB on Vulkan and Direct3D 12).
 
 use crate::cost::scene_sizes::SceneSizes;
+use crate::error::ModelError;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Sequence};
 use crate::ops::composed::attention::MAX_SCORES;
+use crate::tokens::count::TokenCount;
 use crate::tokens::kmeans::seeding::{MAX_TABLE_LEN, pool_len};
 
 /// Lists the tensors of one network that can be its largest, for a batch of equal scenes: description and number of
@@ -58,4 +60,52 @@ fn scores(num_queries: u64, heads: usize, keys: Sequence, sizes: &SceneSizes, sc
 /// Returns the number of distances in the largest tensor of latent K-means, the table that its seeding reads.
 pub fn kmeans_values(num_tokens: usize, num_clusters: usize) -> u64 {
     pool_len(num_tokens, num_clusters, MAX_TABLE_LEN) as u64 * num_tokens as u64
+}
+
+/// Refuses `[views, height, width]` whose encoding, or storing one of the numbers of tokens, takes a tensor of more than `limit`
+/// bytes.
+pub(crate) fn check_encoding(
+    config: &ModelConfig,
+    [num_views, height, width]: [usize; 3],
+    stored_tokens: &[TokenCount],
+    limit: u64,
+) -> Result<(), ModelError> {
+    let sizes = SceneSizes::of(config, num_views, 1, [height, width])?;
+    let mut tensors = largest_tensors(config, Part::Encoder, &sizes, 1);
+    let counts = stored_tokens.iter().filter_map(|count| count.of(sizes.num_tokens).ok());
+    for count in counts.filter(|_| config.architecture.supports_clusters()) {
+        let stored = SceneSizes { num_storage_tokens: Some(count), ..sizes };
+        tensors.extend(largest_tensors(config, Part::Condenser, &stored, 1));
+        // All tokens are stored without clustering.
+        if count < sizes.num_tokens {
+            tensors.push(("the distances of K-means".into(), kmeans_values(sizes.num_tokens, count)));
+        }
+    }
+    let bytes = |values: u64| values * size_of::<f32>() as u64;
+    match tensors.into_iter().max_by_key(|(_, values)| *values) {
+        Some((what, values)) if bytes(values) > limit => {
+            Err(ModelError::TensorTooLarge { what, bytes: bytes(values), limit, num_views })
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The paper's network on 64 views of 1,024 tokens.
+    #[test]
+    fn a_tensor_has_at_most_the_bytes_of_the_limit() {
+        let check = |stored, limit| {
+            check_encoding(&ModelConfig::default(), [64, 256, 256], &[TokenCount::Share(stored)], limit)
+        };
+        // Queries, keys and values of 3 x 768 values. All tokens are stored without distances.
+        let bytes = 64 * 1024 * 3 * 768 * 4;
+        assert!(check(1.0, bytes).is_ok() && check(0.001, bytes).is_ok());
+        let message = check(1.0, bytes - 1).unwrap_err().to_string();
+        assert!(message.contains("64 context views") && message.contains(&bytes.to_string()), "{message}");
+        let message = check(0.5, bytes).unwrap_err().to_string();
+        assert!(message.starts_with("the distances of K-means"), "{message}");
+    }
 }

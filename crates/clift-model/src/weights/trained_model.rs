@@ -7,14 +7,12 @@ use burn::store::PathFilter;
 use burn::tensor::Device;
 use clift_core::ClipViews;
 
-use crate::cost::largest_tensor::{kmeans_values, largest_tensors};
+use crate::cost::largest_tensor::check_encoding;
 use crate::cost::parameters::Parameters;
-use crate::cost::scene_sizes::SceneSizes;
 use crate::device::adapter::max_tensor_bytes;
 use crate::error::ModelError;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
-use crate::network::layers::Part;
 use crate::network::model::{Network, is_condenser};
 use crate::network::renderer::Renderer;
 use crate::tokens::count::TokenCount;
@@ -64,12 +62,12 @@ impl TrainedModel {
         Self { config: config.clone(), network: network.clone(), has_condenser, device }
     }
 
-    /// Copies the context views of a scene to the device, of which one of `stored_tokens` is stored. Refuses views that take a
-    /// tensor larger than the device can hold.
+    /// Copies the context views of a scene to the device. Refuses views if encoding them, or storing one of the numbers of
+    /// tokens, takes a tensor that is too large for the device.
     pub fn upload(&self, context: &ClipViews, stored_tokens: &[TokenCount]) -> Result<Views, ModelError> {
         if let Some(limit) = max_tensor_bytes(&self.device) {
             let sizes = [context.num_views().max(1), context.height, context.width];
-            check_tensors(&self.config, sizes, stored_tokens, limit)?;
+            check_encoding(&self.config, sizes, stored_tokens, limit)?;
         }
         Views::upload(&[context], &self.device)
     }
@@ -90,31 +88,6 @@ impl TrainedModel {
     }
 }
 
-/// Refuses context views whose encoding takes a tensor of more than `limit` bytes.
-fn check_tensors(
-    config: &ModelConfig,
-    [num_views, height, width]: [usize; 3],
-    stored_tokens: &[TokenCount],
-    limit: u64,
-) -> Result<(), ModelError> {
-    let sizes = SceneSizes::of(config, num_views, 1, [height, width])?;
-    let mut tensors = largest_tensors(config, Part::Encoder, &sizes, 1);
-    if config.architecture.supports_clusters() {
-        let counts = stored_tokens.iter().filter_map(|count| count.of(sizes.num_tokens).ok());
-        let num_stored = counts.max().unwrap_or_default();
-        let stored = SceneSizes { num_storage_tokens: Some(num_stored), ..sizes };
-        tensors.extend(largest_tensors(config, Part::Condenser, &stored, 1));
-        tensors.push(("the distances of K-means".into(), kmeans_values(sizes.num_tokens, num_stored)));
-    }
-    let bytes = |values: u64| values * size_of::<f32>() as u64;
-    match tensors.into_iter().max_by_key(|(_, values)| *values) {
-        Some((what, values)) if bytes(values) > limit => {
-            Err(ModelError::TensorTooLarge { what, bytes: bytes(values), limit, num_views })
-        }
-        _ => Ok(()),
-    }
-}
-
 /// Reads the renderer of a network from a weight file, whose sizes may come from a hostile scene file.
 pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let refuse = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
@@ -131,21 +104,4 @@ pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Resu
         return Err(refuse(format!("{count} parameters of the scene's renderer are missing (renderer.{name})")));
     }
     Ok(renderer)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// The paper's network: 1,024 tokens a view, queries, keys and values of 3 x 768 values.
-    #[test]
-    fn a_tensor_of_the_limit_fits_and_one_byte_less_does_not() {
-        let check = |num_views, limit| {
-            check_tensors(&ModelConfig::default(), [num_views, 256, 256], &[TokenCount::Count(64)], limit)
-        };
-        let bytes = 64 * 1024 * 3 * 768 * 4;
-        assert!(check(64, bytes).is_ok());
-        let message = check(64, bytes - 1).unwrap_err().to_string();
-        assert!(message.contains("64 context views") && message.contains(&bytes.to_string()), "{message}");
-    }
 }
