@@ -89,7 +89,7 @@ impl Kernel for Rows<'_> {
 }
 
 impl Rows<'_> {
-    /// Transforms all rows, `GROUP` vectors at a time.
+    /// Transforms all rows, `GROUP` channels at a time.
     #[inline(always)]
     fn transform<const GROUP: usize>(self) {
         let Self { parts, num_heads, head_width, transforms, x } = self;
@@ -98,12 +98,14 @@ impl Rows<'_> {
         for (row, transform) in rows.zip(transforms.chunks_exact(transform_len(head_width))) {
             let (matrices, angles) = transform.split_at(32);
             let (cosines, sines) = angles.split_at(head_width / 4);
+            let [(cosines, _), (sines, _)] = [cosines.as_chunks(), sines.as_chunks()];
             for (part, kind) in row.chunks_exact_mut(part_len).zip(parts) {
                 let matrix = matrix_of(*kind, matrices);
                 for head in part.chunks_exact_mut(head_width) {
-                    let (vectors, pairs) = head.split_at_mut(head_width / 2);
-                    multiply::<GROUP>(&matrix, vectors);
-                    rotate::<GROUP>(kind.sign(), cosines, sines, pairs);
+                    let (groups, _) = head.as_chunks_mut::<GROUP>();
+                    let (vectors, pairs) = groups.split_at_mut(groups.len() / 2);
+                    multiply(&matrix, vectors);
+                    rotate(kind.sign(), cosines, sines, pairs);
                 }
             }
         }
@@ -119,11 +121,10 @@ fn matrix_of(kind: HeadTransform, matrices: &[f32]) -> [f32; 16] {
 
 /// Multiplies 4-vectors by a matrix; `x` holds their first coordinates, then their second and so on.
 #[inline(always)]
-fn multiply<const GROUP: usize>(matrix: &[f32; 16], x: &mut [f32]) {
+fn multiply<const GROUP: usize>(matrix: &[f32; 16], x: &mut [[f32; GROUP]]) {
     let count = x.len() / 4;
-    for start in (0..count).step_by(GROUP) {
-        let read = |j: usize| -> [f32; GROUP] { std::array::from_fn(|k| x[j * count + start + k]) };
-        let vectors = [read(0), read(1), read(2), read(3)];
+    for group in 0..count {
+        let vectors: [[f32; GROUP]; 4] = std::array::from_fn(|j| x[j * count + group]);
         for i in 0..4 {
             let mut sum = [0.0; GROUP];
             for (j, vector) in vectors.iter().enumerate() {
@@ -131,20 +132,17 @@ fn multiply<const GROUP: usize>(matrix: &[f32; 16], x: &mut [f32]) {
                     *sum += matrix[4 * i + j] * value;
                 }
             }
-            x[i * count + start..i * count + start + GROUP].copy_from_slice(&sum);
+            x[i * count + group] = sum;
         }
     }
 }
 
 /// Rotates pairs; `x` holds their first coordinates, then their second.
 #[inline(always)]
-fn rotate<const GROUP: usize>(sign: f32, cosines: &[f32], sines: &[f32], x: &mut [f32]) {
+fn rotate<const GROUP: usize>(sign: f32, cosines: &[[f32; GROUP]], sines: &[[f32; GROUP]], x: &mut [[f32; GROUP]]) {
     let (first, second) = x.split_at_mut(cosines.len());
-    let pairs = first.chunks_exact_mut(GROUP).zip(second.chunks_exact_mut(GROUP));
-    let angles = cosines.chunks_exact(GROUP).zip(sines.chunks_exact(GROUP));
-    for ((first, second), (cosines, sines)) in pairs.zip(angles) {
-        let a: [f32; GROUP] = std::array::from_fn(|k| first[k]);
-        let b: [f32; GROUP] = std::array::from_fn(|k| second[k]);
+    for ((first, second), (cosines, sines)) in first.iter_mut().zip(second).zip(cosines.iter().zip(sines)) {
+        let (a, b) = (*first, *second);
         for k in 0..GROUP {
             let (cosine, sine) = (cosines[k], sign * sines[k]);
             first[k] = cosine * a[k] - sine * b[k];

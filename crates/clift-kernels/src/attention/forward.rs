@@ -37,7 +37,9 @@ pub fn attention_forward(
         return;
     }
     let blocks = sizes.num_queries.div_ceil(QUERY_BLOCK);
-    let parts = sizes.parts(blocks);
+    // Queries are independent: the number of threads changes no sum. Every part packs all keys and values of its head.
+    let parts =
+        (2 * rayon::current_num_threads()).div_ceil((sizes.batch * sizes.num_heads).max(1)).clamp(1, blocks.max(1));
     let output = SharedSlice::new(output);
     let output = HeadBlocks { values: &output, count: sizes.num_queries, width: sizes.dim(), first: 0 };
     let log_sum = SharedSlice::new(log_sum);
@@ -104,8 +106,10 @@ impl<'a> Kernel for Forward<'a> {
                 for row in 0..rows {
                     let scores = &mut scores[row * score_row..][..score_row];
                     let factor = sizes.exponent_scale();
-                    let shrink =
-                        exponentials::<S, O>(simd, &mut scores[..count], factor, &mut highest[row], &mut total[row]);
+                    // Columns that fill up the last vector have no weight.
+                    scores[count..padded::<S>(count)].fill(f32::NEG_INFINITY);
+                    let whole = &mut scores[..padded::<S>(count)];
+                    let shrink = exponentials::<S, O>(simd, whole, factor, &mut highest[row], &mut total[row]);
                     pack_in_place::<S, O>(simd, scores, count);
                     if shrink != 1.0 {
                         scale(simd, &mut sums[row * width..][..width], shrink);
@@ -117,7 +121,8 @@ impl<'a> Kernel for Forward<'a> {
                 multiply::<S, O>(simd, [rows, lanes_of::<S, O>(count), head_width], left, right, (sums, width), true);
             }
             for row in 0..rows {
-                let result = sums[row * width..][..head_width].iter().map(|sum| sum / total[row]);
+                let inverse = 1.0 / total[row];
+                let result = sums[row * width..][..head_width].iter().map(|sum| sum * inverse);
                 // SAFETY: no other task has this query of this head.
                 unsafe { output.write([scene, start + row, head], result) };
             }
@@ -141,27 +146,23 @@ fn exponentials<S: Simd, O: Operands>(
     highest: &mut f32,
     total: &mut f32,
 ) -> f32 {
-    let full = scores.len() / S::LANES * S::LANES;
     let mut largest = simd.splat(f32::NEG_INFINITY);
-    for chunk in scores[..full].chunks_exact(S::LANES) {
+    for chunk in scores.chunks_exact(S::LANES) {
         largest = simd.max(largest, simd.read(chunk));
     }
-    let largest = scores[full..].iter().fold(simd.largest(largest), |a, &b| if a > b { a } else { b });
+    let largest = simd.largest(largest);
     let former = *highest;
     let raised = if former > largest * scale { former } else { largest * scale };
     let shrink = if former == raised { 1.0 } else { (former - raised).exp2() };
     let (factor, shift) = (simd.splat(scale), simd.splat(-raised));
     let mut sum = simd.splat(0.0);
-    for chunk in scores[..full].chunks_exact_mut(S::LANES) {
+    for chunk in scores.chunks_exact_mut(S::LANES) {
         let weight = O::exp2(simd, simd.mul_add(simd.read(chunk), factor, shift));
         simd.write(chunk, weight);
         sum = simd.add(sum, weight);
     }
-    let rest = &mut scores[full..];
-    let weight = O::exp2(simd, simd.mul_add(simd.read(rest), factor, shift));
-    simd.write(rest, weight);
     *highest = raised;
-    *total = *total * shrink + simd.sum(sum) + rest.iter().sum::<f32>();
+    *total = *total * shrink + simd.sum(sum);
     shrink
 }
 

@@ -87,15 +87,10 @@ pub(crate) fn pack_transposed<'a, S: Simd, O: Operands>(
             let block: [&[f32]; MAX_LANES] =
                 std::array::from_fn(|row| if row < count { rows.next().unwrap_or_default() } else { &[] });
             for start in (0..lanes).step_by(S::LANES) {
-                let mut packed = [[0.0; MAX_LANES]; MAX_LANES];
-                for (row, packed) in block.iter().zip(&mut packed).take(count) {
-                    simd.write(packed, O::along(simd, row, start));
-                }
-                for lane in 0..S::LANES.min(lanes - start) {
-                    let to = &mut to[(start + lane) * width + first..][..count];
-                    for (to, packed) in to.iter_mut().zip(&packed) {
-                        *to = packed[lane];
-                    }
+                let mut packed = block.map(|row| O::along(simd, row, start));
+                simd.transpose(&mut packed);
+                for (lane, packed) in packed.iter().enumerate().take(S::LANES.min(lanes - start)) {
+                    simd.write(&mut to[(start + lane) * width + first..][..count], *packed);
                 }
             }
         }

@@ -70,10 +70,13 @@ pub trait Simd: Copy + Send + Sync + 'static {
         unreachable!("only with matrix tiles");
     }
 
-    /// Transposes a matrix of [`Simd::LANES`] vectors. Only with matrix tiles.
+    /// Transposes a matrix of [`Simd::LANES`] vectors, the first of the array.
     #[inline(always)]
-    fn transpose(self, _rows: &mut [Self::V; MAX_LANES]) {
-        unreachable!("only with matrix tiles");
+    fn transpose(self, rows: &mut [Self::V; MAX_LANES]) {
+        let values = rows.map(|row| array(self, row));
+        for (i, row) in rows.iter_mut().enumerate().take(Self::LANES) {
+            *row = self.read(&std::array::from_fn::<_, MAX_LANES, _>(|lane| values[lane][i]));
+        }
     }
 
     /// Reads a vector from the start of a slice; missing values are zero.
