@@ -123,15 +123,7 @@ mod tests {
 
     /// Sixteen tokens of width 16, four views of 16 x 16.
     fn config(device: DeviceName) -> Config {
-        let model = ModelConfig {
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 24,
-            num_encoder_blocks: 1,
-            num_renderer_blocks: 1,
-            ..ModelConfig::default()
-        };
-        let mut config = Config { run_dir: "run".into(), device, model, ..Config::default() };
+        let mut config = Config { run_dir: "run".into(), device, model: ModelConfig::small(), ..Config::default() };
         (config.data.width, config.data.height) = (16, 16);
         config.data.views = ViewSampler { num_targets: 1, ..ViewSampler::default() };
         (config.stage1.batch_size, config.stage2.batch_size) = (2, 2);

@@ -11,14 +11,7 @@ pub fn devices() -> Vec<Device> {
 
 /// Returns a small network with patch tokens.
 pub fn small_clift() -> ModelConfig {
-    ModelConfig {
-        dim: 16,
-        num_heads: 2,
-        feed_forward_dim: 24,
-        num_encoder_blocks: 1,
-        num_renderer_blocks: 2,
-        ..ModelConfig::default()
-    }
+    ModelConfig { num_renderer_blocks: 2, ..ModelConfig::small() }
 }
 
 /// Returns a small network of LVSM's paper, whose tokens are learned.

@@ -75,14 +75,7 @@ fn adapter(_name: DeviceName, _device: &Device) -> String {
 
 /// Encodes, clusters, condenses and renders one clip, and computes the gradient of all three networks.
 fn gradient(device: &Device) -> Result<(f64, Vec<f64>), TrainError> {
-    let config = ModelConfig {
-        dim: 32,
-        num_heads: 2,
-        feed_forward_dim: 64,
-        num_encoder_blocks: 1,
-        num_renderer_blocks: 1,
-        ..ModelConfig::default()
-    };
+    let config = ModelConfig { dim: 32, feed_forward_dim: 64, ..ModelConfig::small() };
     let shape = ClipShape { num_context: 2, num_targets: 1, size: [16, 16] };
     let num_tokens = config.num_tokens(2, 16, 16)?;
     let model = seeded_model(&config, 0, device);

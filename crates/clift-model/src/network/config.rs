@@ -150,6 +150,12 @@ impl From<ModelSection> for ModelConfig {
 }
 
 impl ModelConfig {
+    /// Returns a network of the default kind with a few thousand parameters, for checks.
+    pub fn small() -> Self {
+        let (dim, num_heads, feed_forward_dim) = (16, 2, 24);
+        Self { dim, num_heads, feed_forward_dim, num_encoder_blocks: 1, num_renderer_blocks: 1, ..Self::default() }
+    }
+
     /// Whether linear layers and layer norms have biases. Without them, matrices are normal at the start.
     pub(crate) fn has_biases(&self) -> bool {
         self.architecture != Architecture::LvsmEd

@@ -161,16 +161,7 @@ mod tests {
     use crate::weights::file::{load_adapted, save_weights};
 
     fn config(patch_size: usize) -> ModelConfig {
-        ModelConfig {
-            camera_encoding: CameraEncoding::Gta,
-            patch_size,
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 24,
-            num_encoder_blocks: 1,
-            num_renderer_blocks: 1,
-            ..ModelConfig::default()
-        }
+        ModelConfig { camera_encoding: CameraEncoding::Gta, patch_size, ..ModelConfig::small() }
     }
 
     /// Returns two context views and a target of `4 * scale` by `8 * scale` pixels, whose colours are blocks of `scale` pixels.

@@ -95,17 +95,9 @@ mod tests {
     #[test]
     fn overflows_change_only_the_factor() {
         let device = burn::tensor::Device::flex();
-        let sizes = ModelConfig {
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 24,
-            num_encoder_blocks: 1,
-            num_renderer_blocks: 1,
-            ..ModelConfig::default()
-        };
         let batch = seeded_batch(ClipShape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, None, 1).unwrap();
         let new_state = |precision: Precision, loss_scale: Option<LossScale>| {
-            let model = freeze(Stage::Stage1, seeded_model(&sizes, 3, &device));
+            let model = freeze(Stage::Stage1, seeded_model(&ModelConfig::small(), 3, &device));
             let plain = TrainState::new(model, &OptimizerConfig::default(), device.clone().autodiff());
             TrainState { precision, loss_scale, ..plain }
         };
