@@ -1,10 +1,10 @@
 //! Reads frames of a scene as a clip at the model's size, with normalised poses.
 
-use std::collections::HashMap;
-use std::collections::hash_map::Entry;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use clift_core::{Camera, ClipViews, IntrinsicsNorm, PoseNormalization, PoseRotation, PoseScale, RgbImage, check_near};
+use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::image::fit::fit_image;
@@ -103,7 +103,7 @@ impl ClipReader {
         Ok(cameras)
     }
 
-    /// Reads every distinct frame once, after a check of all normalised poses.
+    /// Reads every distinct frame once, several at a time, after a check of all normalised poses.
     fn fit_frames(
         &self,
         scene: usize,
@@ -116,9 +116,7 @@ impl ClipReader {
         for &frame in frames {
             check_near(&c2w(frame)).map_err(DataError::in_frame(key, frame))?;
         }
-        let mut fitted = HashMap::new();
-        for &frame in frames {
-            let Entry::Vacant(entry) = fitted.entry(frame) else { continue };
+        let read = |&frame: &usize| {
             let fit = |image: &RgbImage| {
                 fit_image(image, cameras[frame].intrinsics, width, height).map_err(DataError::in_frame(key, frame))
             };
@@ -126,9 +124,13 @@ impl ClipReader {
             let weights = coverage.map(|coverage| fit(&coverage)).transpose()?;
             let weights = weights.map(|(coverage, _)| coverage.rgb.into_iter().step_by(3).collect());
             let (image, intrinsics) = fit(&image)?;
-            entry.insert(FittedFrame { image, camera: Camera { c2w: c2w(frame), intrinsics }, weights });
-        }
-        Ok(fitted)
+            Ok((frame, FittedFrame { image, camera: Camera { c2w: c2w(frame), intrinsics }, weights }))
+        };
+        let mut seen = HashSet::new();
+        let distinct: Vec<usize> = frames.iter().copied().filter(|&frame| seen.insert(frame)).collect();
+        let fitted: Vec<Result<_, _>> = distinct.par_iter().map(read).collect();
+        // The error of the first frame, whichever was read first.
+        fitted.into_iter().collect()
     }
 
     fn gather(&self, frames: &[usize], fitted: &HashMap<usize, FittedFrame>) -> ClipViews {

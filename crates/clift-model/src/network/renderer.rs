@@ -64,11 +64,13 @@ impl Renderer {
     /// - `tokens`: one set per scene, shared by its target views, or one set per target view
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
+        let ModelConfig { patch_grids, patch_size, .. } = self.config;
         // One grid needs no keys and values of all blocks at once.
-        match self.config.patch_grids {
-            PatchGrids::One => self.forward(tokens, targets),
-            PatchGrids::Two | PatchGrids::Four => self.render_cached(&self.project_tokens(tokens), targets),
+        if patch_grids == PatchGrids::One {
+            return self.forward(tokens, targets);
         }
+        let cache = self.project_tokens(tokens);
+        patch_grids.mean(patch_size, targets, |targets| self.forward_cached(&cache, targets))
     }
 
     /// Renders target views once, on one patch grid, as in training.
@@ -91,11 +93,18 @@ impl Renderer {
         KeyValueCache::Projected(self.blocks.iter().map(|block| tokens.project(block)).collect())
     }
 
-    /// Renders target views as [`render`](Self::render) does, from the keys and values of
-    /// [`project_tokens`](Self::project_tokens).
-    pub fn render_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
+    /// Returns the number of patch grids that an image is the mean of.
+    pub fn num_patch_grids(&self) -> usize {
+        self.config.patch_grids.patches(self.config.patch_size, [0; 2]).count()
+    }
+
+    /// Renders target views on one of the patch grids, from the keys and values of [`project_tokens`](Self::project_tokens).
+    ///
+    /// # Shapes
+    /// - as [`render`](Self::render)
+    pub fn render_on_grid(&self, cache: &KeyValueCache, targets: &Cameras, grid: usize) -> Tensor<5> {
         let ModelConfig { patch_grids, patch_size, .. } = self.config;
-        patch_grids.mean(patch_size, targets, |targets| self.forward_cached(cache, targets))
+        patch_grids.draw(patch_size, targets, grid, |targets| self.forward_cached(cache, targets))
     }
 
     fn forward_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {

@@ -71,27 +71,43 @@ impl PatchGrids {
         self.shifts(patch_size).into_iter().map(grown)
     }
 
-    /// Returns the mean of the images that `draw` returns for every grid.
+    /// Returns the images that `draw` draws, on one of the grids, of which the first is `grid` 0.
     ///
     /// # Shapes
     /// - `draw`: of cameras of any size, `[batch, views, height, width, 3]`
     /// - returns `[batch, views, height, width, 3]` of the size of `targets`
-    pub(crate) fn mean(self, patch_size: usize, targets: &Cameras, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
+    pub(crate) fn draw(
+        self,
+        patch_size: usize,
+        targets: &Cameras,
+        grid: usize,
+        draw: impl Fn(&Cameras) -> Tensor<5>,
+    ) -> Tensor<5> {
+        let shift = self.shifts(patch_size)[grid];
+        if shift == 0 {
+            return draw(targets);
+        }
+        // The first patch begins `shift` pixels above and left of the image.
         let options = (&targets.intrinsics.device(), targets.intrinsics.dtype());
-        // On a grid whose first patch begins `shift` pixels above and left of the image.
-        let shifted = |shift: usize| {
-            let moved = TensorData::new(vec![0.0, 0.0, shift as f64, shift as f64], [1, 1, 4]);
-            let cameras = Cameras {
-                height: targets.height + patch_size,
-                width: targets.width + patch_size,
-                c2w: targets.c2w.clone(),
-                intrinsics: targets.intrinsics.clone() + Tensor::<3>::from_data(moved, options),
-            };
-            draw(&cameras).narrow(2, shift, targets.height).narrow(3, shift, targets.width)
+        let moved = TensorData::new(vec![0.0, 0.0, shift as f64, shift as f64], [1, 1, 4]);
+        let cameras = Cameras {
+            height: targets.height + patch_size,
+            width: targets.width + patch_size,
+            c2w: targets.c2w.clone(),
+            intrinsics: targets.intrinsics.clone() + Tensor::<3>::from_data(moved, options),
         };
-        let shifts = self.shifts(patch_size);
-        let sum = shifts[1..].iter().fold(draw(targets), |sum, &shift| sum + shifted(shift));
-        if shifts.len() == 1 { sum } else { sum / shifts.len() as f64 }
+        draw(&cameras).narrow(2, shift, targets.height).narrow(3, shift, targets.width)
+    }
+
+    /// Returns the mean of the images that `draw` draws on every grid.
+    ///
+    /// # Shapes
+    /// - as [`draw`](Self::draw)
+    pub(crate) fn mean(self, patch_size: usize, targets: &Cameras, draw: impl Fn(&Cameras) -> Tensor<5>) -> Tensor<5> {
+        let count = self.shifts(patch_size).len();
+        let first = self.draw(patch_size, targets, 0, &draw);
+        let sum = (1..count).fold(first, |sum, grid| sum + self.draw(patch_size, targets, grid, &draw));
+        if count == 1 { sum } else { sum / count as f64 }
     }
 }
 

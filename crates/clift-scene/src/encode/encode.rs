@@ -7,7 +7,8 @@ use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, Tr
 
 use crate::encode::contexts::{Contexts, EncodeOptions};
 use crate::error::SceneError;
-use crate::scene::scene::Scene;
+use crate::scene::scene::{ContextGroup, Scene};
+use crate::scene::scene_renderer::{has_threads, map_in_threads};
 
 /// An encoded scene.
 #[derive(Clone, Debug)]
@@ -41,8 +42,12 @@ pub fn encode(
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
 
     let (mut tokens, mut assignment, mut token_ids) = (Vec::new(), Vec::new(), Vec::new());
-    for (group, count) in groups.iter().zip(counts) {
-        let (values, clusters) = encode_group(model, &group.members(&context), count, options, seed)?;
+    let groups_and_counts: Vec<(&ContextGroup, usize)> = groups.iter().zip(counts).collect();
+    let is_threaded = has_threads(&model.device, model.config.num_patches(1, data.height, data.width)?);
+    let encoded = map_in_threads(is_threaded, &groups_and_counts, |(group, count)| {
+        encode_group(model, &group.members(&context), *count, options, seed)
+    })?;
+    for (values, clusters) in encoded {
         // Tokens and patches are counted over all groups.
         let (first_cluster, first_patch) = (token_ids.len() as u32, assignment.len() as u32);
         assignment.extend(clusters.assignment().iter().map(|&cluster| first_cluster + cluster));

@@ -7,9 +7,10 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::{Camera, Pose, ViewDistance};
 use clift_model::{
-    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, TokenRay, Tokens,
-    open_renderer, render_bytes, renderer_hash,
+    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Precision, Renderer, SelectionRules, Selector,
+    TokenRay, Tokens, open_renderer, render_bytes, renderer_hash,
 };
+use rayon::prelude::*;
 
 use crate::scene::frame_size::{FramePlan, TrainedImage};
 use crate::scene::scene::{ContextGroup, Scene};
@@ -20,9 +21,16 @@ const IMAGES_PER_CALL: usize = 8;
 const PATCHES_PER_CALL: usize = 1 << 15;
 /// Most pixels of several frames that are rendered together.
 const PIXELS_PER_CALL: usize = 1 << 21;
+/// Most patches of an image that one thread renders, beside others: operations on few patches take longer when every one of
+/// them is divided among threads.
+const PATCHES_PER_THREAD: usize = 1 << 10;
+/// Images that threads render before their pixels are added to frames.
+const IMAGES_AT_ONCE: usize = 64;
 /// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
 const BLEND: f64 = 0.15;
 const MAX_BLENDED: usize = 3;
+/// Increase of a group's share of a frame, from one half, over which the other half of its patch grids fades in.
+const FADE_IN: f64 = 0.15;
 
 /// Returns the number of frames of `height` by `width` pixels that [`SceneRenderer::render`] renders together.
 pub fn frames_per_call(height: usize, width: usize) -> usize {
@@ -38,7 +46,10 @@ fn images_per_call([rows, columns]: [usize; 2]) -> usize {
 /// `model`.
 pub fn frame_bytes(scene: &Scene, model: &ModelConfig, [height, width]: [usize; 2]) -> u64 {
     let patches = TrainedImage::new(scene, &scene.context).patches();
-    let num_images = images_per_call(patches);
+    let mut num_images = images_per_call(patches);
+    if patches[0] * patches[1] <= PATCHES_PER_THREAD {
+        num_images = num_images.max(rayon::current_num_threads());
+    }
     let grids = model.patch_grids.patches(model.patch_size, patches);
     let largest = grids.map(|[rows, columns]| rows * columns).max().unwrap_or_default();
     // Three values of four bytes per pixel of the frames, and of one while it is resampled.
@@ -65,7 +76,7 @@ pub struct RenderedView {
     pub tokens: Option<Vec<u32>>,
     /// Seconds of token selection.
     pub select_s: f64,
-    /// Seconds from the tokens to the pixels on the host; the mean of the frames that are rendered together.
+    /// Seconds from the tokens to the pixels on the host; the mean of the frames of a call.
     pub render_s: f64,
 }
 
@@ -91,6 +102,28 @@ struct TokenGroup {
     tokens: Vec<u32>,
     cache: KeyValueCache,
     selector: Selector,
+}
+
+/// What a group contributes to a frame.
+struct Part {
+    group: usize,
+    frame: usize,
+    share: f64,
+    plan: FramePlan,
+    /// Of selected tokens; `None` for all of the group.
+    cache: Option<KeyValueCache>,
+    /// Positions in the scene.
+    tokens: Vec<u32>,
+}
+
+/// An image on one patch grid.
+struct GridImage<'a> {
+    part: &'a Part,
+    camera: Camera,
+    grid: usize,
+    weight: f32,
+    /// Position among all windows of all parts.
+    window: usize,
 }
 
 impl SceneRenderer {
@@ -142,7 +175,8 @@ impl SceneRenderer {
 
     /// Renders the next frames of a path from the groups of tokens nearest to each: of every group from the
     /// `num_render_tokens` tokens nearest to the view, or all its tokens if it has no more. A frame between groups is a mean
-    /// of their images with weights that change continuously along a path; of `num_render_tokens`, each group has its share.
+    /// of their images with weights that change continuously along a path; of `num_render_tokens`, each group has its share. An
+    /// image with at most half of the weight is rendered on half of the patch grids.
     /// Frames of all tokens are rendered [`frames_per_call`] at a time. A frame of another size or field of view than
     /// the context views is resampled from images like theirs: it keeps the field of view of its camera, and a larger one has
     /// no more detail.
@@ -164,89 +198,132 @@ impl SceneRenderer {
         let to_group = |view: &Camera, group: &TokenGroup| self.distance.to_group(&view.c2w, &group.views);
         let to_groups = |view: &Camera| self.groups.iter().map(|group| to_group(view, group)).collect::<Vec<_>>();
         let shares: Vec<_> = views.iter().map(|view| group_shares(&to_groups(view))).collect();
-        let mut rendered: Vec<Option<RenderedView>> = vec![None; views.len()];
-        for group in 0..self.groups.len() {
-            let share = |frame: usize| shares[frame].iter().find(|(other, _)| *other == group).map(|(_, share)| *share);
+        let mut select_s = vec![0.0; views.len()];
+        let mut parts = Vec::new();
+        for (index, group) in self.groups.iter_mut().enumerate() {
+            let share = |frame: usize| shares[frame].iter().find(|(other, _)| *other == index).map(|(_, share)| *share);
             let frames: Vec<(usize, f64)> = (0..views.len()).filter_map(|frame| Some((frame, share(frame)?))).collect();
-            let per_call = if selects { 1 } else { frames_per_call(height, width) };
-            for frames in frames.chunks(per_call) {
-                let cameras: Vec<Camera> = frames.iter().map(|&(frame, _)| views[frame]).collect();
-                let count = (num_render_tokens as f64 * frames[0].1).ceil() as usize;
-                let images = self.render_group(group, &cameras, [height, width], selects.then_some(count))?;
-                for (&(frame, share), image) in frames.iter().zip(images) {
-                    RenderedView::blend(&mut rendered[frame], image, share as f32);
-                }
+            for &(frame, share) in &frames {
+                let started = Instant::now();
+                let count = selects.then_some((num_render_tokens as f64 * share).ceil() as usize);
+                let (plan, cache, tokens) = group.select(&views[frame], [height, width], count)?;
+                parts.push(Part { group: index, frame, share, plan, cache, tokens });
+                select_s[frame] += if selects { started.elapsed().as_secs_f64() } else { 0.0 };
             }
             if selects && frames.is_empty() {
                 // A group that comes back later starts a path of its own.
-                self.groups[group].selector.reset();
+                group.selector.reset();
             }
         }
-        Ok(rendered.into_iter().flatten().collect())
-    }
-
-    /// Renders frames from the tokens of one group: all of them, or selected ones for a single frame.
-    fn render_group(
-        &mut self,
-        group: usize,
-        views: &[Camera],
-        size: [usize; 2],
-        num_render_tokens: Option<usize>,
-    ) -> Result<Vec<RenderedView>, ModelError> {
         let started = Instant::now();
-        let num_groups = self.groups.len();
-        let tokens = &mut self.groups[group];
-        let trained = tokens.trained;
-        let plan = |view: &Camera| FramePlan::new(trained, view, size);
-        let plans: Vec<FramePlan> =
-            tokens.context.cameras(views.iter().copied()).iter().map(plan).collect::<Result<_, _>>()?;
-        let selected = match num_render_tokens.filter(|count| *count < tokens.tokens.len()) {
-            Some(count) => {
-                let (view, [height, width]) = plans[0].whole();
-                Some(tokens.selector.select(&view, height, width, count)?)
-            }
-            None => None,
-        };
-        let select_s = if selected.is_some() { started.elapsed().as_secs_f64() } else { 0.0 };
-        let started = Instant::now();
-        let cache = selected.as_ref().map(|selected| tokens.cache.select(selected));
-        let in_scene = match selected {
-            Some(selected) => Some(selected.into_iter().map(|token| tokens.tokens[token as usize]).collect()),
-            // All tokens of a scene with one group.
-            None if num_groups == 1 => None,
-            None => Some(tokens.tokens.clone()),
-        };
-        let frames = self.draw(cache.as_ref().unwrap_or(&self.groups[group].cache), trained, &plans)?;
-        let render_s = started.elapsed().as_secs_f64() / plans.len() as f64;
-        let view = |pixels| RenderedView { pixels, tokens: in_scene.clone(), select_s, render_s };
-        Ok(frames.into_iter().map(view).collect())
-    }
-
-    /// Draws the windows of frames from keys and values of tokens, [`images_per_call`] at a time, and resamples them.
-    fn draw(
-        &self,
-        cache: &KeyValueCache,
-        trained: TrainedImage,
-        plans: &[FramePlan],
-    ) -> Result<Vec<Vec<f32>>, ModelError> {
-        let windows: Vec<Camera> = plans.iter().flat_map(FramePlan::windows).collect();
-        let [height, width] = trained.size;
-        let mut pixels = Vec::with_capacity(windows.len() * height * width * 3);
-        for windows in windows.chunks(images_per_call(trained.patches())) {
-            let cameras = Cameras::of_views(windows, height, width, &self.device)?;
-            let images = self.renderer.render_cached(cache, &cameras).into_data().convert::<f32>();
-            pixels.extend(images.try_to_vec::<f32>().map_err(ModelError::device)?);
+        let mut rendered = vec![(vec![0.0; height * width * 3], Vec::new()); views.len()];
+        for (part, image) in parts.iter().zip(self.draw(&parts)?) {
+            let (pixels, tokens) = &mut rendered[part.frame];
+            pixels.iter_mut().zip(image).for_each(|(sum, value)| *sum += part.share as f32 * value);
+            tokens.extend_from_slice(&part.tokens);
         }
-        if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
-            return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });
+        let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
+        let are_all = !selects && self.groups.len() == 1;
+        let view = |((pixels, mut tokens), select_s): ((Vec<f32>, Vec<u32>), f64)| {
+            tokens.sort_unstable();
+            RenderedView { pixels, tokens: (!are_all).then_some(tokens), select_s, render_s }
+        };
+        Ok(rendered.into_iter().zip(select_s).map(view).collect())
+    }
+
+    /// Draws the images of parts of frames, each the mean of its patch grids, and resamples them.
+    fn draw(&self, parts: &[Part]) -> Result<Vec<Vec<f32>>, ModelError> {
+        let Some(trained) = self.groups.first().map(|group| group.trained) else { return Ok(Vec::new()) };
+        let image_len = trained.size[0] * trained.size[1] * 3;
+        let [rows, columns] = trained.patches();
+        let is_threaded = has_threads(&self.device, rows * columns);
+        let (per_call, at_once) =
+            if is_threaded { (1, IMAGES_AT_ONCE) } else { (images_per_call(trained.patches()), 1) };
+
+        let num_grids = self.renderer.num_patch_grids();
+        let windows = parts.iter().flat_map(|part| part.plan.windows().into_iter().map(move |camera| (part, camera)));
+        let windows: Vec<(&Part, Camera)> = windows.collect();
+        let image = |grid: usize, window: usize| {
+            let (part, camera) = windows[window];
+            GridImage { part, camera, grid, weight: grid_weight(grid, num_grids, part.group, part.share), window }
+        };
+        let on_grid = |grid: usize| (0..windows.len()).map(move |window| image(grid, window));
+        let images: Vec<GridImage> = (0..num_grids).flat_map(on_grid).filter(|image| image.weight > 0.0).collect();
+        let together = |a: &GridImage, b: &GridImage| {
+            let is_same = std::ptr::eq(a.part, b.part);
+            let has_all = a.part.group == b.part.group && a.part.cache.is_none() && b.part.cache.is_none();
+            a.grid == b.grid && (is_same || has_all)
+        };
+        let calls: Vec<&[GridImage]> = images.chunk_by(together).flat_map(|images| images.chunks(per_call)).collect();
+        let mut pixels = vec![0.0; windows.len() * image_len];
+        for calls in calls.chunks(at_once) {
+            let drawn = map_in_threads(is_threaded, calls, |images| self.draw_images(images, trained.size))?;
+            let values = drawn.iter().flat_map(|images| images.chunks_exact(image_len));
+            for (image, values) in calls.iter().copied().flatten().zip(values) {
+                let sums = &mut pixels[image.window * image_len..][..image_len];
+                sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += image.weight * value);
+            }
         }
         let mut rest = &pixels[..];
-        let frame = |plan: &FramePlan| {
-            let (windows, others) = rest.split_at(plan.windows().len() * height * width * 3);
+        let frame = |part: &Part| {
+            let (windows, others) = rest.split_at(part.plan.windows().len() * image_len);
             rest = others;
-            plan.assemble(windows)
+            part.plan.assemble(windows)
         };
-        Ok(plans.iter().map(frame).collect())
+        Ok(parts.iter().map(frame).collect())
+    }
+
+    /// Draws images from the same tokens on one patch grid.
+    fn draw_images(&self, images: &[GridImage], [height, width]: [usize; 2]) -> Result<Vec<f32>, ModelError> {
+        let GridImage { part, grid, .. } = images[0];
+        let cache = part.cache.as_ref().unwrap_or(&self.groups[part.group].cache);
+        let cameras: Vec<Camera> = images.iter().map(|image| image.camera).collect();
+        let cameras = Cameras::of_views(&cameras, height, width, &self.device)?;
+        let pixels = self.renderer.render_on_grid(cache, &cameras, grid).into_data().convert::<f32>();
+        let pixels = pixels.try_to_vec::<f32>().map_err(ModelError::device)?;
+        match pixels.iter().position(|value| !value.is_finite()) {
+            Some(position) => Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position }),
+            None => Ok(pixels),
+        }
+    }
+}
+
+/// Returns whether images of `num_patches` patches are computed by one thread each.
+pub(crate) fn has_threads(device: &Device, num_patches: usize) -> bool {
+    *device == Device::flex() && num_patches <= PATCHES_PER_THREAD
+}
+
+/// Maps items in the precision of this thread, by threads side by side or one after the other.
+pub(crate) fn map_in_threads<T: Sync, R: Send, E: Send>(
+    is_threaded: bool,
+    items: &[T],
+    map: impl Fn(&T) -> Result<R, E> + Sync,
+) -> Result<Vec<R>, E> {
+    let precision = Precision::current();
+    let map = |item: &T| {
+        let _precision = precision.scope();
+        map(item)
+    };
+    if is_threaded { items.par_iter().map(map).collect() } else { items.iter().map(map).collect() }
+}
+
+impl TokenGroup {
+    /// Plans the group's image of a view and selects `num_render_tokens` tokens; returns their keys and values and their
+    /// positions in the scene. `None` and as many as the group has are all tokens.
+    fn select(
+        &mut self,
+        view: &Camera,
+        size: [usize; 2],
+        num_render_tokens: Option<usize>,
+    ) -> Result<(FramePlan, Option<KeyValueCache>, Vec<u32>), ModelError> {
+        let plan = FramePlan::new(self.trained, &self.context.cameras([*view])[0], size)?;
+        let Some(count) = num_render_tokens.filter(|count| *count < self.tokens.len()) else {
+            return Ok((plan, None, self.tokens.clone()));
+        };
+        let (view, [height, width]) = plan.whole();
+        let selected = self.selector.select(&view, height, width, count)?;
+        let cache = self.cache.select(&selected);
+        Ok((plan, Some(cache), selected.into_iter().map(|token| self.tokens[token as usize]).collect()))
     }
 }
 
@@ -286,22 +363,15 @@ pub(crate) fn group_shares(distances: &[f64]) -> Vec<(usize, f64)> {
     near
 }
 
-impl RenderedView {
-    /// Adds an image with its share of the frame.
-    fn blend(frame: &mut Option<Self>, mut image: Self, share: f32) {
-        image.pixels.iter_mut().for_each(|value| *value *= share);
-        let Some(frame) = frame else {
-            *frame = Some(image);
-            return;
-        };
-        frame.pixels.iter_mut().zip(&image.pixels).for_each(|(sum, value)| *sum += value);
-        frame.select_s += image.select_s;
-        frame.render_s += image.render_s;
-        if let (Some(tokens), Some(more)) = (&mut frame.tokens, image.tokens) {
-            tokens.extend(more);
-            tokens.sort_unstable();
-        }
+/// Returns the weight of a patch grid in the image of a group. Up to one half of the frame, every second grid has none, which
+/// of them alternates between groups; the others fade in with the share.
+fn grid_weight(grid: usize, num_grids: usize, group: usize, share: f64) -> f32 {
+    if num_grids == 1 {
+        return 1.0;
     }
+    let faded_in = ((share - 0.5) / FADE_IN).clamp(0.0, 1.0);
+    let weight = if (grid + group).is_multiple_of(2) { 2.0 - faded_in } else { faded_in };
+    (weight / num_grids as f64) as f32
 }
 
 #[cfg(test)]

@@ -231,3 +231,23 @@ fn shares_of_groups_add_up_and_change_continuously() {
         }
     }
 }
+
+#[test]
+fn weights_of_patch_grids_add_up_and_change_continuously() {
+    for (num_grids, group) in [(1, 0), (2, 0), (2, 1), (4, 1)] {
+        let weight = |grid: usize, share: f64| grid_weight(grid, num_grids, group, share);
+        for share in (0..1000).map(|step| f64::from(step) * 1e-3) {
+            let sum: f32 = (0..num_grids).map(|grid| weight(grid, share)).sum();
+            assert!((sum - 1.0).abs() < 1e-6, "{num_grids} grids, share {share}: {sum}");
+            assert!((0..num_grids).all(|grid| (weight(grid, share) - weight(grid, share + 1e-3)).abs() < 0.01));
+        }
+        assert!((0..num_grids).all(|grid| weight(grid, 1.0) == 1.0 / num_grids as f32));
+        let num_drawn = (0..num_grids).filter(|&grid| weight(grid, 0.5) > 0.0).count();
+        assert_eq!(num_drawn, num_grids.div_ceil(2));
+    }
+    assert_eq!(
+        [0, 1].map(|group| grid_weight(0, 2, group, 0.5)),
+        [1.0, 0.0],
+        "neighbours are drawn on different grids"
+    );
+}
