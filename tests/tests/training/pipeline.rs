@@ -1,6 +1,6 @@
 //! A complete run and every file of its directory.
 
-use crate::support::{Place, STAGE_1, WHOLE, list, number};
+use crate::support::{Place, STAGE_1, WHOLE, list, number, repository};
 
 #[test]
 fn a_run_writes_every_documented_file() {
@@ -150,4 +150,15 @@ fn runs_start_from_weights_of_other_runs() {
     assert_eq!(condenser("seventh"), condenser("first"));
     let other = [&from_first[..], "model.condenser.member_share=true"];
     place.train("eighth", &other).fails_with(2, &["`model.condenser.member_share` = true"]);
+
+    // Two configs of one command.
+    let micro = std::fs::read_to_string(repository("tests/micro.toml")).unwrap();
+    for (name, from) in [("ninth", "first"), ("tenth", "ninth")] {
+        let start = format!("[stage1]\ninit_from = {:?}", place.at(from));
+        let config = micro.replace("runs/micro", &place.at(name).display().to_string()).replace("[stage1]", &start);
+        std::fs::write(place.at(&format!("{name}.toml")), config).unwrap();
+    }
+    let from = format!("parameters from {}", place.at("ninth/stage1/model.safetensors").display());
+    place.clift("train DIR/ninth.toml DIR/tenth.toml --only stage1").ok().notes(&from);
+    place.clift("train DIR/ninth.toml DIR/ninth.toml").fails_with(2, &["the configs have the same run_dir"]);
 }

@@ -1,7 +1,9 @@
 //! `clift train`.
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::rc::Rc;
+use std::sync::atomic::AtomicBool;
 
 use clift_eval::available_bytes;
 use clift_model::peak_flops;
@@ -12,6 +14,7 @@ use clift_train::{
 
 use crate::commands::args::parse::parse_training_step;
 use crate::commands::args::shared_args::ConfigArgs;
+use crate::exit_code::usage_bail;
 use crate::interrupt::{self, Ending};
 use crate::output::progress::progress_sink;
 use crate::output::stdout::{name_adapter, print_evaluation, print_result, print_warning};
@@ -40,8 +43,18 @@ fn connect() -> Result<Rc<Ranks>, TrainError> {
     Ok(Rc::new(ranks))
 }
 
+/// Trains the configs one after the other, all of them checked before.
 fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
-    let config = args.overrides.read(&args.config, Config::validate)?;
+    let read = |path: &PathBuf| args.overrides.read(path, Config::validate);
+    let configs: Vec<Config> = args.configs.iter().map(read).collect::<Result<_, _>>()?;
+    if configs.iter().map(|config| &config.run_dir).collect::<HashSet<_>>().len() < configs.len() {
+        usage_bail!("the configs have the same run_dir: give each its own");
+    }
+    let stop = interrupt::flag(Ending::RUN)?;
+    configs.into_iter().try_for_each(|config| train_config(args, config, &stop, ranks))
+}
+
+fn train_config(args: &TrainArgs, config: Config, stop: &AtomicBool, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     // Before the system ends a run for its memory after hours of training.
     let mut of_rank = config.clone();
     for stage in [Stage::Stage1, Stage::Stage2] {
@@ -52,7 +65,6 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
         print_warning(warning);
     }
     name_adapter(config.device, true);
-    let stop = interrupt::flag(Ending::RUN)?;
     let options = RunOptions { only: args.only, fresh: args.fresh };
     let mut sink = progress_sink();
     let (planned, num_ranks) = (config.clone(), ranks.num_ranks());
@@ -73,7 +85,7 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
     };
     let (run_dir, has_view) = (config.run_dir.clone(), config.model.architecture.supports_clusters());
     let run = Run::open_on(ranks.clone(), config, &options, &mut sink)?;
-    let summary = run.train(args.only, &stop, &mut sink)?;
+    let summary = run.train(args.only, stop, &mut sink)?;
     drop(sink);
     let Some(summary) = summary else { return Ok(()) };
     print_evaluation(&summary, &run_dir.join("eval"))?;
@@ -82,8 +94,9 @@ fn train(args: &TrainArgs, ranks: &Rc<Ranks>) -> anyhow::Result<()> {
 
 #[derive(Debug, clap::Args)]
 pub struct TrainArgs {
-    /// Config file (TOML)
-    pub config: PathBuf,
+    /// Config files (TOML), trained one after the other: a later one may start from the run of an earlier one
+    #[arg(required = true, value_name = "CONFIG")]
+    pub configs: Vec<PathBuf>,
     #[command(flatten)]
     pub overrides: ConfigArgs,
     /// Run one stage: stage1, clusters or stage2
