@@ -1,7 +1,7 @@
 //! Devices and networks of the unit tests.
 
 use burn::tensor::Device;
-use clift_model::{Architecture, CliftVariant, CondenserConfig, DeviceName, ModelConfig};
+use clift_model::{Architecture, CondenserConfig, DeviceName, ModelConfig};
 
 /// Opens the CPU devices of this build.
 pub fn devices() -> Vec<Device> {
@@ -16,16 +16,6 @@ pub fn small_clift() -> ModelConfig {
 
 /// Returns a small network of LVSM's paper, whose tokens are learned.
 pub fn small_lvsm() -> ModelConfig {
-    ModelConfig {
-        architecture: Architecture::LvsmEd,
-        variant: CliftVariant::Paper,
-        num_latents: 7,
-        dim: 15,
-        num_heads: 3,
-        feed_forward_dim: 22,
-        num_encoder_blocks: 1,
-        num_renderer_blocks: 3,
-        condenser: CondenserConfig::NONE,
-        ..ModelConfig::default()
-    }
+    let (architecture, condenser) = (Architecture::LvsmEd, CondenserConfig::NONE);
+    ModelConfig { architecture, num_latents: 7, condenser, ..ModelConfig::small() }
 }

@@ -107,8 +107,8 @@ impl<'a> Kernel for Forward<'a> {
                     let scores = &mut scores[row * score_row..][..score_row];
                     let factor = sizes.exponent_scale();
                     // Columns that fill up the last vector have no weight.
-                    scores[count..padded::<S>(count)].fill(f32::NEG_INFINITY);
                     let whole = &mut scores[..padded::<S>(count)];
+                    whole[count..].fill(f32::NEG_INFINITY);
                     let shrink = exponentials::<S, O>(simd, whole, factor, &mut highest[row], &mut total[row]);
                     pack_in_place::<S, O>(simd, scores, count);
                     if shrink != 1.0 {

@@ -17,15 +17,13 @@ use crate::scene::scene::{ContextGroup, Scene};
 
 /// Most images of one call, which share keys and values, and most frames that are rendered together.
 const IMAGES_PER_CALL: usize = 8;
-/// Most patches of one call with several images: eight images of 512 x 512 pixels.
+/// Most patches of one call with several images, or of images by threads side by side: eight images of 512 x 512 pixels.
 const PATCHES_PER_CALL: usize = 1 << 15;
 /// Most pixels of several frames that are rendered together.
 const PIXELS_PER_CALL: usize = 1 << 21;
 /// Most patches of an image that one thread renders, beside others: operations on few patches take longer when every one of
 /// them is divided among threads.
 const PATCHES_PER_THREAD: usize = 1 << 10;
-/// Images that threads render before their pixels are added to frames.
-const IMAGES_AT_ONCE: usize = 64;
 /// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
 const BLEND: f64 = 0.15;
 const MAX_BLENDED: usize = 3;
@@ -235,11 +233,10 @@ impl SceneRenderer {
     fn draw(&self, parts: &[Part]) -> Result<Vec<Vec<f32>>, ModelError> {
         let Some(trained) = self.groups.first().map(|group| group.trained) else { return Ok(Vec::new()) };
         let image_len = trained.size[0] * trained.size[1] * 3;
-        let [rows, columns] = trained.patches();
-        let is_threaded = has_threads(&self.device, rows * columns);
-        let (per_call, at_once) =
-            if is_threaded { (1, IMAGES_AT_ONCE) } else { (images_per_call(trained.patches()), 1) };
-
+        let num_patches: usize = trained.patches().iter().product();
+        let is_threaded = has_threads(&self.device, num_patches);
+        let most = images_per_call(trained.patches());
+        let (per_call, at_once) = if is_threaded { (1, PATCHES_PER_CALL / num_patches.max(1)) } else { (most, 1) };
         let num_grids = self.renderer.num_patch_grids();
         let windows = parts.iter().flat_map(|part| part.plan.windows().into_iter().map(move |camera| (part, camera)));
         let windows: Vec<(&Part, Camera)> = windows.collect();
@@ -281,10 +278,8 @@ impl SceneRenderer {
         let cameras = Cameras::of_views(&cameras, height, width, &self.device)?;
         let pixels = self.renderer.render_on_grid(cache, &cameras, grid).into_data().convert::<f32>();
         let pixels = pixels.try_to_vec::<f32>().map_err(ModelError::device)?;
-        match pixels.iter().position(|value| !value.is_finite()) {
-            Some(position) => Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position }),
-            None => Ok(pixels),
-        }
+        let Some(position) = pixels.iter().position(|value| !value.is_finite()) else { return Ok(pixels) };
+        Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position })
     }
 }
 
