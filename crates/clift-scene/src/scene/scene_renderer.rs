@@ -21,8 +21,8 @@ const IMAGES_PER_CALL: usize = 8;
 const PATCHES_PER_CALL: usize = 1 << 15;
 /// Most pixels of several frames that are rendered together.
 const PIXELS_PER_CALL: usize = 1 << 21;
-/// Most patches of an image that one thread renders, beside others: operations on few patches take longer when every one of
-/// them is divided among threads.
+/// Most patches of an image that is rendered by a single thread, in parallel with other images: operations on few patches are
+/// slower when each is divided among threads.
 const PATCHES_PER_THREAD: usize = 1 << 10;
 /// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
 const BLEND: f64 = 0.15;
@@ -102,7 +102,7 @@ struct TokenGroup {
     selector: Selector,
 }
 
-/// What a group contributes to a frame.
+/// The image of one group for a frame, and its share of the frame.
 struct Part {
     group: usize,
     frame: usize,
@@ -288,7 +288,7 @@ pub(crate) fn has_threads(device: &Device, num_patches: usize) -> bool {
     *device == Device::flex() && num_patches <= PATCHES_PER_THREAD
 }
 
-/// Maps items in the precision of this thread, by threads side by side or one after the other.
+/// Maps items in the precision of this thread: in parallel if `is_threaded`, else one after the other.
 pub(crate) fn map_in_threads<T: Sync, R: Send, E: Send>(
     is_threaded: bool,
     items: &[T],
@@ -358,8 +358,8 @@ pub(crate) fn group_shares(distances: &[f64]) -> Vec<(usize, f64)> {
     near
 }
 
-/// Returns the weight of a patch grid in the image of a group. Up to one half of the frame, every second grid has none, which
-/// of them alternates between groups; the others fade in with the share.
+/// Returns the weight of a patch grid in the image of a group. Up to a share of one half, every second grid has weight 0: the odd
+/// grids of groups with an even index, the even grids of the others. They fade in with the share.
 fn grid_weight(grid: usize, num_grids: usize, group: usize, share: f64) -> f32 {
     if num_grids == 1 {
         return 1.0;
