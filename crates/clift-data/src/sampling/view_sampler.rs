@@ -50,9 +50,6 @@ pub struct ViewSampler {
     pub max_gap: [usize; 2],
     /// Steps of the warm-up of both gaps; 0 disables the warm-up.
     pub warm_up_steps: u64,
-    /// Whether items of few contexts have shorter gaps: divided by `max_context / num_context`, rounded down, as in
-    /// `DepthSplat`.
-    pub shorten_gaps: bool,
     /// Number of target views of an item. Targets may repeat, and may be context frames.
     pub num_targets: usize,
     /// The range: `consecutive` frames, or a frame and those `nearest` to it, as in photos without an order.
@@ -67,7 +64,6 @@ impl Default for ViewSampler {
             min_gap: [25, 45],
             max_gap: [45, 135],
             warm_up_steps: 30_000,
-            shorten_gaps: true,
             num_targets: 6,
             window: Window::Consecutive,
         }
@@ -114,10 +110,14 @@ impl ViewSampler {
 
     /// Returns the smallest and the largest gap at `step` of a batch with `num_context` contexts.
     ///
-    /// With `shorten_gaps` both are divided by `max_context / num_context`, rounded down.
+    /// As in `DepthSplat`, both are divided by `max_context / num_context`, rounded down.
     pub fn gap_bounds(&self, step: u64, num_context: usize) -> [usize; 2] {
-        [self.min_gap, self.max_gap]
-            .map(|[init, last]| linear_warm_up(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
+        let divisor = self.gap_divisor(num_context);
+        [self.min_gap, self.max_gap].map(|[init, last]| linear_warm_up(init, last, self.warm_up_steps, step) / divisor)
+    }
+
+    fn gap_divisor(&self, num_context: usize) -> usize {
+        (self.max_context / num_context.max(1)).max(1)
     }
 
     /// Returns the smallest number of frames of a scene that is long enough at every step up to `last_step`, for every
@@ -201,10 +201,6 @@ impl ViewSampler {
             Window::Consecutive => None,
             Window::Nearest => Some(source.cameras(scene)?.iter().map(|camera| camera.c2w).collect()),
         })
-    }
-
-    fn gap_divisor(&self, num_context: usize) -> usize {
-        if self.shorten_gaps { (self.max_context / num_context.max(1)).max(1) } else { 1 }
     }
 }
 
