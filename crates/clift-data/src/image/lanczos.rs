@@ -8,6 +8,7 @@ use std::f64::consts::PI;
 use std::ops::Range;
 
 use clift_core::RgbImage;
+use multiversion::multiversion;
 
 /// Fraction bits of a weight: 32 minus 8 for the pixel and 2 for the overshoot of a sum.
 const PRECISION_BITS: u32 = 32 - 8 - 2;
@@ -100,34 +101,9 @@ fn round(sum: i32) -> u8 {
     (sum >> PRECISION_BITS).clamp(0, 255) as u8
 }
 
-/// Compiles a pass twice on x86-64, for any processor and for AVX2, and selects at run time. The sums are integers, so
-/// both results are equal.
-macro_rules! fastest {
-    ($name:ident, $portable:ident, ($($arg:ident: $type:ty),*)) => {
-        fn $name($($arg: $type),*) -> Vec<u8> {
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx2")]
-                fn with_avx2($($arg: $type),*) -> Vec<u8> {
-                    $portable($($arg),*)
-                }
-                if is_x86_feature_detected!("avx2") {
-                    // SAFETY: the processor has AVX2.
-                    return unsafe { with_avx2($($arg),*) };
-                }
-            }
-            $portable($($arg),*)
-        }
-    };
-}
-
-fastest!(resize_columns, columns, (rgb: &[u8], width: usize, taps: &[Taps]));
-fastest!(resize_rows, rows, (rgb: &[u8], row_bytes: usize, top: usize, taps: &[Taps]));
-
-/// Resizes the rows of an image along the columns. Inlined, so that the caller's instruction set applies.
-#[inline(always)]
-#[allow(clippy::inline_always)]
-fn columns(rgb: &[u8], width: usize, taps: &[Taps]) -> Vec<u8> {
+/// Resizes the rows of an image along the columns. The sums are integers: equal with and without AVX2.
+#[multiversion(targets("x86_64+avx2"))]
+fn resize_columns(rgb: &[u8], width: usize, taps: &[Taps]) -> Vec<u8> {
     let mut resized = Vec::with_capacity(rgb.len() / width * taps.len());
     // Four channels, one of them unused, make a pixel one vector.
     let mut wide = vec![[0_i32; 4]; width];
@@ -150,9 +126,8 @@ fn columns(rgb: &[u8], width: usize, taps: &[Taps]) -> Vec<u8> {
 }
 
 /// Resizes an image along the rows. `rgb` starts with row `top` of the image whose rows the taps index.
-#[inline(always)]
-#[allow(clippy::inline_always)]
-fn rows(rgb: &[u8], row_bytes: usize, top: usize, taps: &[Taps]) -> Vec<u8> {
+#[multiversion(targets("x86_64+avx2"))]
+fn resize_rows(rgb: &[u8], row_bytes: usize, top: usize, taps: &[Taps]) -> Vec<u8> {
     let mut resized = Vec::with_capacity(row_bytes * taps.len());
     let mut sums = vec![0; row_bytes];
     for Taps { first, weights } in taps {

