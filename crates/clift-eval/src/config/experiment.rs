@@ -1,8 +1,6 @@
 //! The experiments of the paper as evaluation settings.
 
-use std::str::FromStr;
-
-use clift_model::{ModelError, TokenCount, parse_value};
+use clift_model::TokenCount;
 use strum::{IntoStaticStr, VariantArray};
 
 use crate::config::eval_config::EvalConfig;
@@ -49,14 +47,6 @@ impl Experiment {
             // As in the published table: no momentum, no count per cell.
             eval.selection = Selection::Global;
         }
-    }
-}
-
-impl FromStr for Experiment {
-    type Err = ModelError;
-
-    fn from_str(name: &str) -> Result<Self, ModelError> {
-        parse_value("preset", name)
     }
 }
 

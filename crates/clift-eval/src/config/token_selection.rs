@@ -1,8 +1,6 @@
 //! Token selection settings.
 
-use std::str::FromStr;
-
-use clift_model::{ModelError, SelectionPreset, parse_value};
+use clift_model::SelectionPreset;
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -31,13 +29,5 @@ impl Selection {
             Self::Scaled => Some(SelectionPreset::Scaled),
             Self::Random => None,
         }
-    }
-}
-
-impl FromStr for Selection {
-    type Err = ModelError;
-
-    fn from_str(name: &str) -> Result<Self, ModelError> {
-        parse_value("selection", name)
     }
 }

@@ -1,13 +1,11 @@
 //! Multiply-accumulates of the networks, and conventions to count them.
 
 use std::iter::Sum;
-use std::str::FromStr;
 
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::cost::scene_sizes::SceneSizes;
 use crate::error::ModelError;
-use crate::names::parse_value;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, RENDER_TOKENS, Rows};
 
@@ -42,14 +40,6 @@ impl FlopConvention {
             Self::Paper => "GFLOPs (paper)",
             Self::Macs => "GMACs",
         }
-    }
-}
-
-impl FromStr for FlopConvention {
-    type Err = ModelError;
-
-    fn from_str(name: &str) -> Result<Self, ModelError> {
-        parse_value("convention", name)
     }
 }
 

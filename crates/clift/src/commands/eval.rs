@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clift_data::{SourceKind, Split};
 use clift_eval::{Experiment, Selection};
-use clift_model::{ModelPath, TokenCount};
+use clift_model::{ModelPath, TokenCount, parse_value};
 use clift_scene::TokenCoding;
 use clift_train::{Config, EvalFolder, Run, evaluate_model};
 
@@ -111,7 +111,7 @@ pub struct EvalArgs {
     /// Sets the methods, --stored-tokens, --render and --selection; options of the command line take precedence. main: quality
     /// against data size. ablation: random tokens, K-means, K-means with condenser. patchwise: tiles of the views against
     /// K-means, with and without condenser; needs --with. budget: half of the tokens stored, decreasing rendered counts.
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = |name: &str| parse_value::<Experiment>("preset", name))]
     pub preset: Option<Experiment>,
     /// Add a run of LVSM, or one of this stage 1 and another clusters.grouping
     ///
@@ -126,7 +126,7 @@ pub struct EvalArgs {
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
     /// Select rendered tokens by this rule: paper, global, scaled or random
-    #[arg(long, value_name = "PRESET")]
+    #[arg(long, value_name = "PRESET", value_parser = |name: &str| parse_value::<Selection>("selection", name))]
     pub selection: Option<Selection>,
     /// Formats of the tokens: f32, f16, coded, or coded-DB, e.g. f16,coded-0.1
     #[arg(long = "format", value_delimiter = ',', value_name = "FORMAT")]

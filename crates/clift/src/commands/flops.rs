@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clift_eval::table;
-use clift_model::{FlopConvention, Macs, TokenCount};
+use clift_model::{FlopConvention, Macs, TokenCount, parse_value};
 use clift_train::{Config, check_plan};
 use serde::Serialize;
 
@@ -98,7 +98,7 @@ pub struct FlopsArgs {
     /// Config file (TOML) with the sizes to count [default: the paper's sizes]
     pub config: Option<PathBuf>,
     /// Counting convention: paper or macs
-    #[arg(long, default_value = "macs")]
+    #[arg(long, default_value = "macs", value_parser = |name: &str| parse_value::<FlopConvention>("convention", name))]
     pub convention: FlopConvention,
     /// Rendered tokens, as numbers or shares [default: the paper's, or the config's]
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]

@@ -8,7 +8,9 @@ use clap::builder::RangedU64ValueParser;
 use clift_core::{Camera, StagedDir, interpolate_path, is_empty_folder, mean_intrinsics, median, orbit_path};
 use clift_data::{plural, read_poses};
 use clift_eval::{Animation, Canvas, available_bytes};
-use clift_model::{DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, SelectionPreset, TokenCount};
+use clift_model::{
+    DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, SelectionPreset, TokenCount, parse_value,
+};
 use clift_scene::{MAX_SIDE_PX, Scene, SceneRenderer, check_frames, frame_bytes, frames_per_call, load_renderer};
 use clift_train::TrainError;
 use serde::Serialize;
@@ -267,7 +269,7 @@ pub struct RenderArgs {
     #[arg(long, value_name = "COUNT")]
     pub render: Option<TokenCount>,
     /// Select rendered tokens by this rule: paper, global or scaled
-    #[arg(long, value_name = "PRESET", default_value = "scaled")]
+    #[arg(long, value_name = "PRESET", default_value = "scaled", value_parser = |name: &str| parse_value::<SelectionPreset>("selection", name))]
     pub selection: SelectionPreset,
     /// Average 1, 2 or 4 renderings with shifted patches [default: the model's]
     #[arg(long, value_name = "COUNT")]

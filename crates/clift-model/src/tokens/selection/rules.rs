@@ -1,13 +1,8 @@
 //! Weights and grid of the token selection, by preset.
 
-use std::str::FromStr;
-
 use clift_core::{Camera, DVec3};
 use serde::Deserialize;
 use strum::{Display, IntoStaticStr, VariantArray};
-
-use crate::error::ModelError;
-use crate::names::parse_value;
 
 /// The distance of a token to a cell is the angle between their rays, in radians, plus this weight times the distance of their
 /// cameras, in normalized units.
@@ -52,14 +47,6 @@ impl SelectionPreset {
     /// Returns the rules of the preset.
     pub fn rules(self) -> SelectionRules {
         SelectionRules { per_cell: self != Self::Global, scaled: self == Self::Scaled }
-    }
-}
-
-impl FromStr for SelectionPreset {
-    type Err = ModelError;
-
-    fn from_str(name: &str) -> Result<Self, ModelError> {
-        parse_value("selection", name)
     }
 }
 

@@ -5,6 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::names::parse_value;
 use crate::tokens::selection::rules::SelectionPreset;
 
 /// Returns a camera at `origin`, rotated by `angle` about the y axis, for an image of 64 x 64.
@@ -153,9 +154,7 @@ fn zero_tokens_and_non_finite_inputs_are_refused() {
         let message = Selector::new(SelectionPreset::Paper.rules(), &rays).unwrap_err().to_string();
         assert!(message.starts_with("invalid ray of token 1"), "{message}");
     }
-    assert_eq!("global".parse::<SelectionPreset>().unwrap(), SelectionPreset::Global);
-    assert_eq!(
-        "all".parse::<SelectionPreset>().unwrap_err().to_string(),
-        "`selection` = all: write one of paper, global, scaled"
-    );
+    let parsed = |name: &str| parse_value::<SelectionPreset>("selection", name);
+    assert_eq!(parsed("global").unwrap(), SelectionPreset::Global);
+    assert_eq!(parsed("all").unwrap_err().to_string(), "`selection` = all: write one of paper, global, scaled");
 }
