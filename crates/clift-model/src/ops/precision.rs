@@ -13,6 +13,7 @@ use std::marker::PhantomData;
 
 use burn::tensor::{DType, Device, Tensor};
 use clift_kernels::{InstructionSet, OperandType};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -130,6 +131,26 @@ impl Drop for PrecisionScope {
     fn drop(&mut self) {
         CURRENT.set(self.former);
     }
+}
+
+/// Maps items in the precision of this thread: in parallel if `is_threaded`, else one after the other.
+///
+/// # Errors
+/// The first error in the order of the items.
+pub fn map_in_threads<T: Sync, R: Send, E: Send>(
+    is_threaded: bool,
+    items: &[T],
+    map: impl Fn(&T) -> Result<R, E> + Sync,
+) -> Result<Vec<R>, E> {
+    let precision = Precision::current();
+    let map = |item: &T| {
+        let _precision = precision.scope();
+        map(item)
+    };
+    if !is_threaded {
+        return items.iter().map(map).collect();
+    }
+    items.par_iter().map(map).collect::<Vec<_>>().into_iter().collect()
 }
 
 #[cfg(test)]

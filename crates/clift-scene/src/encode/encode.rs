@@ -3,12 +3,12 @@
 
 use clift_core::{ClipViews, derive_seed};
 use clift_data::ClipReader;
-use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel};
+use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, map_in_threads};
 
 use crate::encode::contexts::{Contexts, EncodeOptions};
 use crate::error::SceneError;
 use crate::scene::scene::{ContextGroup, Scene};
-use crate::scene::scene_renderer::{has_threads, map_in_threads};
+use crate::scene::scene_renderer::has_threads;
 
 /// An encoded scene.
 #[derive(Clone, Debug)]

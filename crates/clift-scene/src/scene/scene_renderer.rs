@@ -7,10 +7,9 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::{Camera, Pose, ViewDistance};
 use clift_model::{
-    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Precision, Renderer, SelectionRules, Selector,
-    TokenRay, Tokens, open_renderer, render_bytes, renderer_hash,
+    Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, TokenRay, Tokens,
+    map_in_threads, open_renderer, render_bytes, renderer_hash,
 };
-use rayon::prelude::*;
 
 use crate::scene::frame_size::{FramePlan, TrainedImage};
 use crate::scene::scene::{ContextGroup, Scene};
@@ -286,20 +285,6 @@ impl SceneRenderer {
 /// Returns whether images of `num_patches` patches are computed by one thread each.
 pub(crate) fn has_threads(device: &Device, num_patches: usize) -> bool {
     *device == Device::flex() && num_patches <= PATCHES_PER_THREAD
-}
-
-/// Maps items in the precision of this thread: in parallel if `is_threaded`, else one after the other.
-pub(crate) fn map_in_threads<T: Sync, R: Send, E: Send>(
-    is_threaded: bool,
-    items: &[T],
-    map: impl Fn(&T) -> Result<R, E> + Sync,
-) -> Result<Vec<R>, E> {
-    let precision = Precision::current();
-    let map = |item: &T| {
-        let _precision = precision.scope();
-        map(item)
-    };
-    if is_threaded { items.par_iter().map(map).collect() } else { items.iter().map(map).collect() }
 }
 
 impl TokenGroup {

@@ -212,7 +212,8 @@ pub struct Stage1Config {
     pub further_sizes: Vec<[usize; 2]>,
     /// Scenes per update.
     pub batch_size: usize,
-    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them.
+    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them, as do
+    /// the threads of `flex`.
     pub accumulate: usize,
     /// Smallest and largest share of the tokens that the renderer receives; the share is sampled every step.
     pub keep_tokens: [f64; 2],
@@ -277,7 +278,8 @@ pub struct Stage2Config {
     pub steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
-    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them.
+    /// Number of micro-batches per update, at most the batch size. Less memory, same gradients. Several ranks share them, as do
+    /// the threads of `flex`.
     pub accumulate: usize,
     /// Learning rate of the renderer, as a factor of the condenser's.
     pub renderer_lr_factor: f64,

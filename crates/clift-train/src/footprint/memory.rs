@@ -46,7 +46,8 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
 
 fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
     let settings = config.stage(stage);
-    let num_scenes = settings.micro_batch_size();
+    let at_once = if config.device == DeviceName::Flex { rayon::current_num_threads() } else { 1 };
+    let num_scenes = settings.batch_size.min(settings.micro_batch_size() * at_once);
     let num_image_values = image_values(config);
     let vgg =
         (config.loss.perceptual_weight > 0.0).then(|| VggShape::VGG19.sizes(config.data.height, config.data.width));
@@ -62,7 +63,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
     let sizes = UpdateSizes {
         trained: stage.trained(),
         num_scenes,
-        is_accumulated: num_scenes < settings.batch_size,
+        is_accumulated: settings.micro_batch_size() < settings.batch_size,
         // Of GPUs with matrix instructions: without them f16 is computed, and saved, in f32.
         saves_half: match config.precision {
             Precision::F32 => false,

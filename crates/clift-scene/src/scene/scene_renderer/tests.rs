@@ -1,6 +1,6 @@
 //! Renderings of scenes, groups and windows against independent references.
 
-use clift_model::{CameraEncoding, Network, SelectionPreset, psnr, save_weights};
+use clift_model::{CameraEncoding, Network, Precision, SelectionPreset, psnr, save_weights};
 
 use super::*;
 use crate::scene::scene::tests::{camera, scene, scene_of_groups};
@@ -99,6 +99,19 @@ fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
                 whole.reset();
             }
         }
+        // Between the groups, on any number of threads, in the precision of the caller.
+        let mut view = scene.context[0];
+        view.c2w.translation = view.c2w.translation.midpoint(scene.context[2].c2w.translation);
+        let pixels = |num_threads: usize, precision: Precision| {
+            let threads = rayon::ThreadPoolBuilder::new().num_threads(num_threads).build().unwrap();
+            let mut whole = whole.clone();
+            threads.install(|| {
+                let _precision = precision.scope();
+                whole.render(&[view, scene.context[0]], 16, 24, 12).unwrap().remove(0).pixels
+            })
+        };
+        let expected = pixels(1, Precision::Bf16);
+        assert!(pixels(3, Precision::Bf16) == expected && pixels(3, Precision::F32) != expected);
     }
 }
 
