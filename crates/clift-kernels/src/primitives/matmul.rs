@@ -3,7 +3,7 @@
 
 use std::mem::MaybeUninit;
 
-use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, Operands, Simd, Tile, has_matrix_tiles};
+use crate::simd::vector::{MATRIX_LANES, MATRIX_ROWS, MAX_LANES, Operands, Simd, Tile, has_matrix_tiles};
 
 /// Lanes of A that are laid out for matrix tiles at a time.
 const MATRIX_BLOCK: usize = 4 * MATRIX_LANES;
@@ -140,7 +140,10 @@ unsafe fn copy_transposed<S: Simd>(simd: S, from: *const f32, step: usize, lanes
         for lane in (0..lanes).step_by(S::LANES) {
             // SAFETY: by the caller's promise.
             unsafe {
-                let mut block = std::array::from_fn(|i| simd.load(from.add((lane + i) * step + row)));
+                let mut block = [simd.splat(0.0); MAX_LANES];
+                for (i, vector) in block.iter_mut().enumerate() {
+                    *vector = simd.load(from.add((lane + i) * step + row));
+                }
                 simd.transpose(&mut block);
                 for (i, vector) in block.into_iter().enumerate() {
                     simd.store(to.add((row + i) * MATRIX_BLOCK + lane), vector);

@@ -87,7 +87,11 @@ pub(crate) fn pack_transposed<'a, S: Simd, O: Operands>(
             let block: [&[f32]; MAX_LANES] =
                 std::array::from_fn(|row| if row < count { rows.next().unwrap_or_default() } else { &[] });
             for start in (0..lanes).step_by(S::LANES) {
-                let mut packed = block.map(|row| O::along(simd, row, start));
+                // A closure of `map` would be compiled without the instruction set.
+                let mut packed = [simd.splat(0.0); MAX_LANES];
+                for (packed, row) in packed.iter_mut().zip(block) {
+                    *packed = O::along(simd, row, start);
+                }
                 simd.transpose(&mut packed);
                 for (lane, packed) in packed.iter().enumerate().take(S::LANES.min(lanes - start)) {
                     simd.write(&mut to[(start + lane) * width + first..][..count], *packed);
