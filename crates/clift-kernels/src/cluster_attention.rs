@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
-use crate::simd::vector::{Operands, Simd};
+use crate::simd::vector::{Operands, Simd, dot};
 
 /// Sizes of a cluster attention, and the members of every segment.
 #[derive(Clone, Debug)]
@@ -211,15 +211,6 @@ impl Kernel for Backward<'_> {
             }
         }
     }
-}
-
-#[inline(always)]
-fn dot<S: Simd>(simd: S, a: &[f32], b: &[f32]) -> f32 {
-    let mut total = simd.splat(0.0);
-    for (a, b) in a.chunks(S::LANES).zip(b.chunks(S::LANES)) {
-        total = simd.mul_add(simd.read(a), simd.read(b), total);
-    }
-    simd.sum(total)
 }
 
 /// Computes `to += factor * from`.

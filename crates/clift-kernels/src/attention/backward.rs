@@ -10,7 +10,7 @@ use crate::primitives::packing::{lanes_of, pack_across, pack_in_place, pack_pane
 use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel, OperandType};
-use crate::simd::vector::{Operands, Simd};
+use crate::simd::vector::{Operands, Simd, dot};
 
 /// Keys per block: a task holds a block of scores and one of their gradients.
 const BACKWARD_KEYS: usize = 256;
@@ -63,7 +63,7 @@ fn backward_into(
     let blocks = num_keys.div_ceil(BACKWARD_KEYS);
     let parts = sizes.parts(blocks);
     // Every part of the keys contributes to the gradients of all queries.
-    let partial: Vec<Vec<f32>> = (0..sizes.batch * num_heads * parts)
+    let mut partial: Vec<Vec<f32>> = (0..sizes.batch * num_heads * parts)
         .into_par_iter()
         .map(|task| {
             let (head, part) = (task / parts, task % parts);
@@ -84,14 +84,18 @@ fn backward_into(
             grad_query
         })
         .collect();
-    (0..sizes.batch * num_heads).into_par_iter().for_each(|head| {
-        let parts = &partial[head * parts..(head + 1) * parts];
+    partial.par_chunks_mut(parts).enumerate().for_each(|(head, parts)| {
+        let (sums, others) = parts.split_first_mut().expect("at least one part");
+        for other in others {
+            sums.iter_mut().zip(&*other).for_each(|(sum, value)| *sum += value);
+        }
         for row in 0..num_queries {
-            let width = parts[0].len() / num_queries;
-            let values = (row * width..row * width + head_width)
-                .map(|i| parts.iter().map(|part| part[i]).sum::<f32>() * sizes.scale());
+            let sums = &sums[row * (sums.len() / num_queries)..][..head_width];
             // SAFETY: no other task has this head.
-            unsafe { grad_query.write([head / num_heads, row, head % num_heads], values) };
+            unsafe {
+                let values = sums.iter().map(|sum| sum * sizes.scale());
+                grad_query.write([head / num_heads, row, head % num_heads], values);
+            }
         }
     });
 }
@@ -166,7 +170,7 @@ impl<'a> Kernel for BackwardTask<'a> {
         };
         let outputs = rows_of(output, 0..num_queries).zip(rows_of(grad_output, 0..num_queries));
         for (to, (output, grad)) in delta.iter_mut().zip(outputs) {
-            *to = output.iter().zip(grad).map(|(a, b)| a * b).sum();
+            *to = dot(simd, output, grad);
         }
         let log_sum = &log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
         for first_key in keys.clone().step_by(BACKWARD_KEYS) {

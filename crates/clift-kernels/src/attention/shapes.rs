@@ -71,6 +71,7 @@ impl HeadBlocks<'_> {
     ///
     /// # Safety
     /// No other thread may read or write this head of this row at the same time.
+    #[inline(always)]
     pub(crate) unsafe fn write(&self, [scene, row, head]: [usize; 3], values: impl ExactSizeIterator<Item = f32>) {
         let start = (scene * self.count + row) * self.width + self.first + head * values.len();
         // SAFETY: by the caller's promise.

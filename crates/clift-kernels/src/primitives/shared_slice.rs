@@ -23,6 +23,7 @@ impl<'a> SharedSlice<'a> {
     ///
     /// # Safety
     /// Parts that exist at the same time must not overlap.
+    #[inline(always)]
     #[expect(clippy::mut_from_ref, reason = "parts are disjoint by the caller's promise")]
     pub(crate) unsafe fn part(&self, start: usize, len: usize) -> &mut [f32] {
         assert!(start <= self.len && len <= self.len - start, "the part lies inside the slice");

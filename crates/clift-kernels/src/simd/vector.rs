@@ -107,6 +107,16 @@ pub trait Simd: Copy + Send + Sync + 'static {
     }
 }
 
+/// Returns the sum of the products of two rows.
+#[inline(always)]
+pub(crate) fn dot<S: Simd>(simd: S, a: &[f32], b: &[f32]) -> f32 {
+    let mut total = simd.splat(0.0);
+    for (a, b) in a.chunks(S::LANES).zip(b.chunks(S::LANES)) {
+        total = simd.mul_add(simd.read(a), simd.read(b), total);
+    }
+    simd.sum(total)
+}
+
 /// `2^a` by a polynomial of the distance to the nearest integer, highest power first. Results below `2^-126` are between zero
 /// and that value, results above `2^127` become `2^127`. NaN stays NaN.
 #[inline(always)]
