@@ -68,7 +68,7 @@ fn the_program_alone_encodes_photos_renders_and_trains() {
         .prints("animation, for a browser: orbit/animation.png");
     let ran = alone(
         "train configs/capture.toml --only stage1 --set data.source=auto --set data.root=scene --set run_dir=run \
-         --set stage1.steps=1 --set stage1.batch_size=1 --set eval.num_validation_scenes=1",
+         --set stage1.steps=1 --set stage1.batch_size=1 --set stage1.accumulate=1 --set eval.num_validation_scenes=1",
     );
     ran.notes("config: configs/capture.toml, which ships with clift").notes(" parameters from ").notes("/rooms-");
     // Names of the repository, not of files beside the program.
