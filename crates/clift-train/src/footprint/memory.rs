@@ -9,6 +9,7 @@ use clift_model::{
 use crate::config::config::{Algorithm, Config};
 use crate::error::TrainError;
 use crate::events::{RunStep, Stage};
+use crate::step::train_state::num_at_once;
 
 /// Target views that an evaluation renders at once.
 pub const VIEWS_PER_PASS: usize = 8;
@@ -46,7 +47,8 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
 
 fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
     let settings = config.stage(stage);
-    let at_once = if config.device == DeviceName::Flex { rayon::current_num_threads() } else { 1 };
+    let scene = largest_scene(config, stage)?;
+    let at_once = num_at_once(config.device == DeviceName::Flex, scene.num_context_patches);
     let num_scenes = settings.batch_size.min(settings.micro_batch_size() * at_once);
     let num_image_values = image_values(config);
     let vgg =
@@ -71,7 +73,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
             Precision::F16 => config.device == DeviceName::Wgpu,
         },
         matrix_moments: if settings.optimizer.algorithm == Algorithm::Muon { 1 } else { 2 },
-        scene: largest_scene(config, stage)?,
+        scene,
         num_image_values,
         loss,
         loss_parameters: vgg.map_or(0.0, |vgg| vgg.parameters),

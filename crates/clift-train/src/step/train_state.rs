@@ -95,8 +95,9 @@ impl TrainState {
             let grads = total.clone().mul_scalar(share * factor).backward();
             Ok(Some((GradientsParams::from_grads(grads, &model), *share, [total.inner(), mse.inner()])))
         };
-        // On a CPU, a thread computes a micro-batch faster than all threads compute one after the other.
-        let at_once = if device == Device::flex().autodiff() { rayon::current_num_threads() } else { 1 };
+        let patch_area = model.renderer.patch_size().pow(2);
+        let pixels = batch.clips.first().map_or(0, |clip| clip.context.images.len() / 3);
+        let at_once = num_at_once(device == Device::flex().autodiff(), pixels / patch_area);
         let rounds: Vec<_> = batch.rounds(parts).enumerate().collect();
         for rounds in rounds.chunks(at_once) {
             let results = map_in_threads(at_once > 1, rounds, |(_, micro_batch)| differentiate(micro_batch))?;
@@ -137,6 +138,12 @@ impl TrainState {
         }
         is_overflow
     }
+}
+
+/// Returns the number of micro-batches that are computed at once, by one thread each: operations on few context patches are
+/// slower when each is divided among threads; those on many need the memory.
+pub(crate) fn num_at_once(is_flex: bool, num_context_patches: usize) -> usize {
+    if is_flex && num_context_patches <= 1 << 10 { rayon::current_num_threads() } else { 1 }
 }
 
 /// Reads the losses and mean squared errors of all parts, added in the order of the parts, and the gradient norm of rank 0,
