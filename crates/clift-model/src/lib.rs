@@ -56,7 +56,7 @@ pub use clift_kernels::InstructionSet;
 pub use device::adapter::{ADAPTER_VARIABLE, Adapter, adapters, max_tensor_bytes, product_instructions, used_adapter};
 pub use device::ledger::{KernelLaunches, observe_kernels, reserved_bytes};
 pub use device::name::DeviceName;
-pub use ops::precision::{Precision, map_in_threads};
+pub use ops::precision::{Precision, has_threads, map_in_threads};
 // Images and cameras
 pub use views::patch_grids::PatchGrids;
 pub use views::rays::RayFrame;

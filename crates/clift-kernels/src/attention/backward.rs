@@ -91,11 +91,9 @@ fn backward_into(
         }
         for row in 0..num_queries {
             let sums = &sums[row * (sums.len() / num_queries)..][..head_width];
+            let values = sums.iter().map(|sum| sum * sizes.scale());
             // SAFETY: no other task has this head.
-            unsafe {
-                let values = sums.iter().map(|sum| sum * sizes.scale());
-                grad_query.write([head / num_heads, row, head % num_heads], values);
-            }
+            unsafe { grad_query.write([head / num_heads, row, head % num_heads], values) };
         }
     });
 }

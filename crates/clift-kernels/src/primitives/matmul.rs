@@ -140,6 +140,7 @@ unsafe fn copy_transposed<S: Simd>(simd: S, from: *const f32, step: usize, lanes
         for lane in (0..lanes).step_by(S::LANES) {
             // SAFETY: by the caller's promise.
             unsafe {
+                // By a loop, as in `pack_transposed`.
                 let mut block = [simd.splat(0.0); MAX_LANES];
                 for (i, vector) in block.iter_mut().enumerate() {
                     *vector = simd.load(from.add((lane + i) * step + row));

@@ -87,7 +87,7 @@ pub(crate) fn pack_transposed<'a, S: Simd, O: Operands>(
             let block: [&[f32]; MAX_LANES] =
                 std::array::from_fn(|row| if row < count { rows.next().unwrap_or_default() } else { &[] });
             for start in (0..lanes).step_by(S::LANES) {
-                // A closure of `map` would be compiled without the instruction set.
+                // By a loop: the closure of `map` is compiled without the instruction set, a call per vector.
                 let mut packed = [simd.splat(0.0); MAX_LANES];
                 for (packed, row) in packed.iter_mut().zip(block) {
                     *packed = O::along(simd, row, start);

@@ -133,6 +133,12 @@ impl Drop for PrecisionScope {
     }
 }
 
+/// Returns whether items of `num_patches` patches, images or scenes, are computed by one thread each: operations on few patches
+/// are slower when each is divided among threads.
+pub fn has_threads(is_flex: bool, num_patches: usize) -> bool {
+    is_flex && num_patches <= 1 << 10
+}
+
 /// Maps items in the precision of this thread: in parallel if `is_threaded`, else one after the other.
 ///
 /// # Errors

@@ -1,14 +1,16 @@
 //! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
+use burn::tensor::Device;
 use clift_core::{ClipViews, derive_seed};
 use clift_data::ClipReader;
-use clift_model::{Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, map_in_threads};
+use clift_model::{
+    Clusters, ModelError, SceneClusters, TokenCount, TokenKind, TrainedModel, has_threads, map_in_threads,
+};
 
 use crate::encode::contexts::{Contexts, EncodeOptions};
 use crate::error::SceneError;
 use crate::scene::scene::{ContextGroup, Scene};
-use crate::scene::scene_renderer::has_threads;
 
 /// An encoded scene.
 #[derive(Clone, Debug)]
@@ -43,7 +45,8 @@ pub fn encode(
 
     let (mut tokens, mut assignment, mut token_ids) = (Vec::new(), Vec::new(), Vec::new());
     let groups_and_counts: Vec<(&ContextGroup, usize)> = groups.iter().zip(counts).collect();
-    let is_threaded = has_threads(&model.device, model.config.num_patches(1, data.height, data.width)?);
+    let num_patches = model.config.num_patches(1, data.height, data.width)?;
+    let is_threaded = has_threads(model.device == Device::flex(), num_patches);
     let encoded = map_in_threads(is_threaded, &groups_and_counts, |(group, count)| {
         encode_group(model, &group.members(&context), *count, options, seed)
     })?;

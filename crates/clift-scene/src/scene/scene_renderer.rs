@@ -8,7 +8,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use clift_core::{Camera, Pose, ViewDistance};
 use clift_model::{
     Cameras, KeyValueCache, ModelConfig, ModelError, PatchGrids, Renderer, SelectionRules, Selector, TokenRay, Tokens,
-    map_in_threads, open_renderer, render_bytes, renderer_hash,
+    has_threads, map_in_threads, open_renderer, render_bytes, renderer_hash,
 };
 
 use crate::scene::frame_size::{FramePlan, TrainedImage};
@@ -20,9 +20,6 @@ const IMAGES_PER_CALL: usize = 8;
 const PATCHES_PER_CALL: usize = 1 << 15;
 /// Most pixels of several frames that are rendered together.
 const PIXELS_PER_CALL: usize = 1 << 21;
-/// Most patches of an image that is rendered by a single thread, in parallel with other images: operations on few patches are
-/// slower when each is divided among threads.
-const PATCHES_PER_THREAD: usize = 1 << 10;
 /// Differences in distance over which groups are blended, in the units of [`ViewDistance`].
 const BLEND: f64 = 0.15;
 const MAX_BLENDED: usize = 3;
@@ -44,7 +41,7 @@ fn images_per_call([rows, columns]: [usize; 2]) -> usize {
 pub fn frame_bytes(scene: &Scene, model: &ModelConfig, [height, width]: [usize; 2]) -> u64 {
     let patches = TrainedImage::new(scene, &scene.context).patches();
     let mut num_images = images_per_call(patches);
-    if patches[0] * patches[1] <= PATCHES_PER_THREAD {
+    if has_threads(true, patches[0] * patches[1]) {
         num_images = num_images.max(rayon::current_num_threads());
     }
     let grids = model.patch_grids.patches(model.patch_size, patches);
@@ -233,7 +230,7 @@ impl SceneRenderer {
         let Some(trained) = self.groups.first().map(|group| group.trained) else { return Ok(Vec::new()) };
         let image_len = trained.size[0] * trained.size[1] * 3;
         let num_patches: usize = trained.patches().iter().product();
-        let is_threaded = has_threads(&self.device, num_patches);
+        let is_threaded = has_threads(self.device == Device::flex(), num_patches);
         let most = images_per_call(trained.patches());
         let (per_call, at_once) = if is_threaded { (1, PATCHES_PER_CALL / num_patches.max(1)) } else { (most, 1) };
         let num_grids = self.renderer.num_patch_grids();
@@ -280,11 +277,6 @@ impl SceneRenderer {
         let Some(position) = pixels.iter().position(|value| !value.is_finite()) else { return Ok(pixels) };
         Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position })
     }
-}
-
-/// Returns whether images of `num_patches` patches are computed by one thread each.
-pub(crate) fn has_threads(device: &Device, num_patches: usize) -> bool {
-    *device == Device::flex() && num_patches <= PATCHES_PER_THREAD
 }
 
 impl TokenGroup {

@@ -4,7 +4,7 @@ use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor};
-use clift_model::{Network, Precision, map_in_threads};
+use clift_model::{Network, Precision, has_threads, map_in_threads};
 
 use crate::config::config::OptimizerConfig;
 use crate::distributed::parts::BatchParts;
@@ -95,9 +95,9 @@ impl TrainState {
             let grads = total.clone().mul_scalar(share * factor).backward();
             Ok(Some((GradientsParams::from_grads(grads, &model), *share, [total.inner(), mse.inner()])))
         };
-        let patch_area = model.renderer.patch_size().pow(2);
-        let pixels = batch.clips.first().map_or(0, |clip| clip.context.images.len() / 3);
-        let at_once = num_at_once(device == Device::flex().autodiff(), pixels / patch_area);
+        let num_pixels = batch.clips.first().map_or(0, |clip| clip.context.images.len() / 3);
+        let num_context_patches = num_pixels / model.renderer.patch_size().pow(2);
+        let at_once = num_at_once(device == Device::flex().autodiff(), num_context_patches);
         let rounds: Vec<_> = batch.rounds(parts).enumerate().collect();
         for rounds in rounds.chunks(at_once) {
             let results = map_in_threads(at_once > 1, rounds, |(_, micro_batch)| differentiate(micro_batch))?;
@@ -140,10 +140,9 @@ impl TrainState {
     }
 }
 
-/// Returns the number of micro-batches that are computed at once, by one thread each: operations on few context patches are
-/// slower when each is divided among threads; those on many need the memory.
+/// Returns the number of micro-batches that are computed at once; they are in memory together.
 pub(crate) fn num_at_once(is_flex: bool, num_context_patches: usize) -> usize {
-    if is_flex && num_context_patches <= 1 << 10 { rayon::current_num_threads() } else { 1 }
+    if has_threads(is_flex, num_context_patches) { rayon::current_num_threads() } else { 1 }
 }
 
 /// Reads the losses and mean squared errors of all parts, added in the order of the parts, and the gradient norm of rank 0,
@@ -184,8 +183,8 @@ mod tests {
         let batch = seeded_batch(ClipShape { num_context: 2, num_targets: 2, size: [16, 16] }, 5, None, 1).unwrap();
         let weights = |num_threads: usize, precision: Precision| {
             let model = freeze(Stage::Stage1, seeded_model(&ModelConfig::small(), 3, &Device::flex()));
-            let state = TrainState::new(model, &OptimizerConfig::default(), Device::flex().autodiff());
-            let state = TrainState { precision, ..state };
+            let mut state = TrainState::new(model, &OptimizerConfig::default(), Device::flex().autodiff());
+            state.precision = precision;
             let threads = rayon::ThreadPoolBuilder::new().num_threads(num_threads).build().unwrap();
             let (state, update) = threads.install(|| state.step(&batch, 5, 1e-4.into(), 1.0)).unwrap();
             assert!(update.applied);

@@ -269,7 +269,8 @@ pub struct RenderArgs {
     #[arg(long, value_name = "COUNT")]
     pub render: Option<TokenCount>,
     /// Select rendered tokens by this rule: paper, global or scaled
-    #[arg(long, value_name = "PRESET", default_value = "scaled", value_parser = |name: &str| parse_value::<SelectionPreset>("selection", name))]
+    #[arg(long, value_name = "PRESET", default_value = "scaled")]
+    #[arg(value_parser = |name: &str| parse_value::<SelectionPreset>("selection", name))]
     pub selection: SelectionPreset,
     /// Average 1, 2 or 4 renderings with shifted patches [default: the model's]
     #[arg(long, value_name = "COUNT")]

@@ -100,8 +100,8 @@ fn a_view_is_rendered_from_the_nearest_group_in_its_frame() {
             }
         }
         // Between the groups, on any number of threads, in the precision of the caller.
-        let mut view = scene.context[0];
-        view.c2w.translation = view.c2w.translation.midpoint(scene.context[2].c2w.translation);
+        let view = camera(0.1, 0.0);
+        assert_eq!(whole.clone().render(&[view], 16, 24, 24).unwrap()[0].tokens.as_ref().unwrap().len(), 24);
         let pixels = |num_threads: usize, precision: Precision| {
             let threads = rayon::ThreadPoolBuilder::new().num_threads(num_threads).build().unwrap();
             let mut whole = whole.clone();
