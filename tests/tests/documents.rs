@@ -190,7 +190,10 @@ fn shrink(args: &mut Vec<String>) {
     match (command.as_str(), args.get(1).map(String::as_str)) {
         ("train", _) => {
             default(args, "--device", "flex");
-            set(args, &SMALL_RUN);
+            // Each of several configs keeps its own run.
+            let several = args.iter().filter(|arg| arg.ends_with(".toml")).count() > 1;
+            args.extend(several.then(|| "--fresh".to_owned()));
+            set(args, &SMALL_RUN[usize::from(several)..]);
             set(args, &["loss.perceptual_weight=0", "stage1.steps=1", "stage2.steps=1"]);
         }
         ("plan", _) => set(args, &SMALL_RUN),
@@ -278,19 +281,14 @@ fn prepare(base: &Path) {
         let lvsm = ["model.architecture='lvsm-ed'", "model.condenser={num_blocks=0}", "stage1.keep_tokens=[1.0,1.0]"];
         train(&[&lvsm[..], &[run_dir.as_str(), latents.as_str()]].concat());
     }
-    for name in ["runs/a", "runs/b"] {
-        copy(&base.join("runs/tiny"), name);
-    }
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
     take_small_images(base, &["-o".into(), "models/re10k".into()]);
-    let mut rooms = ["train", "configs/rooms-64.toml"].map(str::to_owned).to_vec();
+    let mut rooms = ["train", "configs/rooms-64.toml", "configs/rooms.toml"].map(str::to_owned).to_vec();
     shrink(&mut rooms);
-    rooms.extend(["--set", "run_dir=runs/rooms", "--set", "model.patch_size=8"].map(str::to_owned));
     clift(&rooms.iter().map(String::as_str).collect::<Vec<_>>());
-    for name in ["runs/capture", "runs/attic"] {
-        copy(&base.join("runs/rooms"), name);
+    for (from, to) in [("tiny", "a"), ("tiny", "b"), ("rooms", "capture"), ("rooms", "attic")] {
+        copy(&base.join("runs").join(from), &format!("runs/{to}"));
     }
     clift(&["export", "runs/rooms", "-o", "models/rooms"]);
-    let tiny = ["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"];
-    clift(&tiny);
+    clift(&["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"]);
 }

@@ -124,7 +124,7 @@ impl fmt::Display for SkipReport {
 }
 
 /// Joins the first few names, with dots for the others.
-pub(crate) fn first_few<S: AsRef<str>>(names: &[S]) -> String {
+pub fn first_few<S: AsRef<str>>(names: &[S]) -> String {
     let mut shown: Vec<&str> = names.iter().take(MAX_NAMES_SHOWN).map(AsRef::as_ref).collect();
     if names.len() > shown.len() {
         shown.push("..");

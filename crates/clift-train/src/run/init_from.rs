@@ -5,6 +5,7 @@ use std::path::Path;
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
+use clift_data::first_few;
 use clift_model::{ModelPath, Network, NetworkAdapter, check_condenser, find_shipped, load_adapted, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};
@@ -48,7 +49,10 @@ pub(crate) fn init_from(
     if loaded.applied.is_empty() {
         return Err(TrainError::bad_file(what, path)(lack));
     }
-    let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
+    let list = |names: &[String]| match names.len() {
+        0 => "none".into(),
+        count => format!("{count} ({})", first_few(names)),
+    };
     // The rest of the file is not lost where the other stage takes it.
     if stage == Stage::Stage2 || config.stage2.init_from.is_some() {
         loaded.unused.retain(|name| part.matches(name));
