@@ -191,7 +191,7 @@ fn shrink(args: &mut Vec<String>) {
         ("train", _) => {
             default(args, "--device", "flex");
             // Each of several configs keeps its own run.
-            let several = args.iter().filter(|arg| arg.ends_with(".toml")).count() > 1;
+            let several = args.iter().filter(|arg| arg.starts_with("configs/")).count() > 1;
             args.extend(several.then(|| "--fresh".to_owned()));
             set(args, &SMALL_RUN[usize::from(several)..]);
             set(args, &["loss.perceptual_weight=0", "stage1.steps=1", "stage2.steps=1"]);
