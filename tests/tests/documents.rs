@@ -190,7 +190,7 @@ fn shrink(args: &mut Vec<String>) {
     match (command.as_str(), args.get(1).map(String::as_str)) {
         ("train", _) => {
             default(args, "--device", "flex");
-            // Each of several configs keeps its own run.
+            // Each of several configs keeps its own `run_dir`, the first key.
             let several = args.iter().filter(|arg| arg.starts_with("configs/")).count() > 1;
             args.extend(several.then(|| "--fresh".to_owned()));
             set(args, &SMALL_RUN[usize::from(several)..]);
