@@ -127,15 +127,15 @@ fn released_variants_train() {
 fn dl3dv_starts_from_re10k_and_lists_new_parameters() {
     let place = Place::new();
     import(&place, &checkpoint("re10k"), "released-re10k", "3", "re10k");
-    let from = place.at("re10k");
     let model = "model={variant='released-dl3dv', dim=15, num_heads=3, feed_forward_dim=22, num_encoder_blocks=1, \
                  num_renderer_blocks=2}";
-    let set = [model, &format!("stage1.init_from={from:?}"), "stage1.steps=0"];
+    let set = [model, &format!("stage1.init_from={:?}", place.at("re10k")), "stage1.steps=0"];
     let ran = place.train("dl3dv --only stage1", &set).ok();
-    let ran = ran.notes("encoder.blocks.0.attn.qk_norm.query.weight");
-    let ran = ran.notes("renderer.blocks.1.cross_attn.qk_norm.key.weight");
-    ran.notes("lift_norm.norm.bias, lift_norm.norm.weight").notes("unused in the file: condenser.released.");
     let (old, new) = (place.model("re10k"), place.weights("dl3dv", "stage1"));
+    let added: Vec<&String> = new.0.keys().filter(|name| !old.0.contains_key(*name)).collect();
+    assert_eq!(added.len(), 12, "queries and keys of five attention layers, weight and bias of a norm: {added:?}");
+    ran.notes("initialized, not in the file: 12 (encoder.blocks.0.attn.qk_norm.key.weight, ")
+        .notes("lift_norm.norm.bias, ..); unused in the file: 22 (condenser.released.");
     for (name, values) in old.0.iter().filter(|(name, _)| !name.starts_with("condenser.")) {
         assert_eq!(&new.0[name], values, "{name}");
     }
