@@ -22,6 +22,7 @@ mod rgb_image;
 mod statistics;
 #[cfg(test)]
 mod testing;
+mod wording;
 
 // Cameras and poses.
 pub use error::CameraError;
@@ -52,3 +53,6 @@ pub use random::{
 
 // Statistics.
 pub use statistics::{MinMedianMax, mean, median, p95, quartiles, standard_error};
+
+// Messages.
+pub use wording::{first_few, plural};

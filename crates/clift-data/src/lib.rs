@@ -37,7 +37,7 @@ pub use config::DataConfig;
 pub use dataset::{half_size_reader, open_dataset, open_training_dataset, resized_reader};
 pub use error::{DataError, WorkerPanic};
 pub use scene_source::{SceneSource, Split, is_held_out};
-pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, first_few, plural};
+pub use skip_report::{SkipReport, SkippedFrame, SkippedScene};
 
 // Layouts on disk, and synthetic scenes.
 pub use sources::chunks::chunk_source::ChunkSource;

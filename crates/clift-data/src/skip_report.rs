@@ -3,10 +3,9 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use clift_core::{first_few, plural};
 use serde::{Deserialize, Serialize};
 
-/// Number of names per reason in a printed report.
-const MAX_NAMES_SHOWN: usize = 3;
 /// Number of reasons in a printed report.
 const MAX_REASONS_SHOWN: usize = 8;
 
@@ -121,20 +120,6 @@ impl fmt::Display for SkipReport {
         }
         self.notes.iter().try_for_each(|note| write!(f, "; {note}"))
     }
-}
-
-/// Joins the first few names, with dots for the others.
-pub fn first_few<S: AsRef<str>>(names: &[S]) -> String {
-    let mut shown: Vec<&str> = names.iter().take(MAX_NAMES_SHOWN).map(AsRef::as_ref).collect();
-    if names.len() > shown.len() {
-        shown.push("..");
-    }
-    shown.join(", ")
-}
-
-/// Formats a count with its noun: `1 scene`, `2 scenes`.
-pub fn plural(count: usize, noun: &str) -> String {
-    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
 #[cfg(test)]

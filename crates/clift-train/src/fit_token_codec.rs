@@ -4,8 +4,8 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use clift_core::derive_seed;
-use clift_data::{ClipReader, plural};
+use clift_core::{derive_seed, plural};
+use clift_data::ClipReader;
 use clift_eval::{EvalConfig, EvalError, EvalFrames, EvalSplit, evaluation_items};
 use clift_model::{Grouping, ModelPath, TrainedModel};
 use clift_scene::{CodecOptions, SceneError, TokenCodec, fit_codec};

@@ -2,9 +2,7 @@
 
 use std::path::Path;
 
-use clift_core::{Camera, CameraError, DVec3, IntrinsicsNorm, Pose};
-
-use crate::skip_report::plural;
+use clift_core::{Camera, CameraError, DVec3, IntrinsicsNorm, Pose, plural};
 
 /// A camera, and the scale of its rotation if it was divided out.
 pub(crate) type ScaledCamera = (Camera<IntrinsicsNorm>, Option<f64>);

@@ -2,10 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_core::{first_few, plural};
+
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
 use crate::scene_source::Split;
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::SkipReport;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
 use crate::sources::photos::image_folder::num_images;

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
-use clift_core::replace_file;
-use clift_data::{ClipReader, EvaluationItem, SkipReport, plural};
+use clift_core::{plural, replace_file};
+use clift_data::{ClipReader, EvaluationItem, SkipReport};
 use clift_model::{Architecture, LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips, ModelError};
 use clift_scene::TokenCoding;
 

@@ -4,8 +4,8 @@ use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use base64::prelude::{BASE64_STANDARD, Engine};
-use clift_core::{RgbImage, replace_file};
-use clift_data::{SkipReport, encode_jpeg, plural};
+use clift_core::{RgbImage, plural, replace_file};
+use clift_data::{SkipReport, encode_jpeg};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::error::EvalError;

@@ -6,8 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use clift_core::{mean, median, p95, quartiles, replace_file, standard_error};
-use clift_data::plural;
+use clift_core::{mean, median, p95, plural, quartiles, replace_file, standard_error};
 use clift_scene::MIN_CONTEXT_PSNR;
 use serde::{Deserialize, Serialize};
 

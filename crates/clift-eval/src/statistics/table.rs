@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use clift_data::plural;
+use clift_core::plural;
 use clift_scene::CodedLoss;
 
 use crate::config::method::Method;

@@ -12,7 +12,7 @@ use burn::store::{
     PyTorchToBurnAdapter, SafetensorsStore,
 };
 use burn::tensor::{DType, TensorData};
-use clift_core::{TEMPORARY, folder_of, publish_file};
+use clift_core::{TEMPORARY, first_few, folder_of, publish_file};
 
 use crate::error::ModelError;
 use crate::weights::hash::visit;
@@ -35,7 +35,6 @@ impl LoadReport {
         if self.missing.is_empty() && self.unused.is_empty() {
             return Ok(());
         }
-        let first_few = |names: &[String]| names.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         let reason = format!(
             "the file belongs to another model: {} missing parameters ({}), {} unused tensors ({})",
             self.missing.len(),

@@ -3,7 +3,7 @@
 use std::num::NonZero;
 
 use burn::tensor::Device;
-use clift_data::plural;
+use clift_core::plural;
 use clift_model::DeviceName;
 
 use crate::distributed::ranks::Ranks;

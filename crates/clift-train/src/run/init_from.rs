@@ -5,7 +5,7 @@ use std::path::Path;
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
-use clift_data::first_few;
+use clift_core::first_few;
 use clift_model::{ModelPath, Network, NetworkAdapter, check_condenser, find_shipped, load_adapted, refuse_checkpoint};
 
 use crate::config::config::{Config, Stage2Config};

@@ -9,8 +9,8 @@ use burn::module::{Module, ParamGroup};
 use burn::optim::lr_scheduler::DynLrScheduler;
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::tensor::Device;
-use clift_core::make_folder;
-use clift_data::{Prefetcher, plural};
+use clift_core::{make_folder, plural};
+use clift_data::Prefetcher;
 use clift_eval::peak_bytes;
 use clift_model::{Network, psnr_of_mse, weights_hash};
 

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clift_data::{ClipReader, Split, plural};
+use clift_core::plural;
+use clift_data::{ClipReader, Split};
 use clift_eval::{EvalFrames, EvalSplit};
 use clift_scene::TokenCodec;
 use clift_train::{fit_token_codec, lock_run};

@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use clap::builder::RangedU64ValueParser;
-use clift_core::{Camera, StagedDir, interpolate_path, is_empty_folder, mean_intrinsics, median, orbit_path};
-use clift_data::{plural, read_poses};
+use clift_core::{Camera, StagedDir, interpolate_path, is_empty_folder, mean_intrinsics, median, orbit_path, plural};
+use clift_data::read_poses;
 use clift_eval::{Animation, Canvas, available_bytes};
 use clift_model::{
     DeviceName, ModelConfig, ModelError, ModelPath, PatchGrids, Precision, SelectionPreset, TokenCount, parse_value,

@@ -2,7 +2,7 @@
 
 use std::io::{Write, stderr};
 
-use clift_data::plural;
+use clift_core::plural;
 use clift_train::{Event, RunStep, Sink, StepEvent};
 use indicatif::ProgressBar;
 

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_data::plural;
+use clift_core::plural;
 use clift_scene::{CheckedView, EncodedScene, MIN_CONTEXT_PSNR, WrittenScene};
 
 use crate::output::stdout::{print_result, print_warning};

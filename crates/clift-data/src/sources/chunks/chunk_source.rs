@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use clift_core::{Camera, IntrinsicsNorm, RgbImage, widest_fov_deg};
+use clift_core::{Camera, IntrinsicsNorm, RgbImage, first_few, plural, widest_fov_deg};
 use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::image::codec::decode_image;
 use crate::scene_source::{SceneSource, Split};
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::SkipReport;
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::index_cache::{CachedChunk, CachedScene, ChunkIndexCache};
 use crate::sources::chunks::table::{CHUNKS_PER_CALL, ChunkTable, ODDITIES, ScanProgress, SceneTable};

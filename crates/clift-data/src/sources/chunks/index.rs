@@ -4,12 +4,13 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
 
+use clift_core::{first_few, plural};
 use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::{file_names, has_ending};
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::SkipReport;
 use crate::sources::chunks::table::{CHUNKS_PER_CALL, ChunkTable, ScanProgress};
 
 /// Largest number of files that are tried for one that tells chunks from files of one scene.

@@ -5,7 +5,7 @@
 use std::collections::{BTreeMap, HashSet};
 use std::path::Path;
 
-use clift_core::{Intrinsics, IntrinsicsNorm, Pose, folder_of};
+use clift_core::{Intrinsics, IntrinsicsNorm, Pose, first_few, folder_of, plural};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use serde_json::value::RawValue;
@@ -16,7 +16,6 @@ use crate::files::listing::natural_order;
 use crate::geometry::lens::Lens;
 use crate::geometry::scaled_rotation::{note_on_scales, unscaled};
 use crate::image::codec::read_header;
-use crate::skip_report::{first_few, plural};
 use crate::sources::photos::image_locator::ImageLocator;
 use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene, PosesFrom, exchanges, unusable};
 

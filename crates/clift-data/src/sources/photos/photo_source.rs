@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use clift_core::{Camera, DVec3, IntrinsicsNorm, RgbImage, widest_fov_deg};
+use clift_core::{Camera, DVec3, IntrinsicsNorm, RgbImage, first_few, plural, widest_fov_deg};
 use image::metadata::Orientation;
 use rayon::prelude::*;
 
@@ -13,7 +13,7 @@ use crate::image::codec::has_alpha;
 use crate::image::fit::covering_size;
 use crate::image::lanczos::resize_lanczos;
 use crate::scene_source::{SceneSource, is_held_out};
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::SkipReport;
 use crate::sources::keys::find_by_name;
 use crate::sources::photos::photo::{MissingPhoto, NO_IMAGE, Photo, PhotoOptions, PhotoScene, Turn};
 use crate::sources::photos::scene_folder::SceneFolder;

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use clift_core::plural;
+
 use crate::error::DataError;
 use crate::files::bounded::{read_bounded, read_start};
 use crate::geometry::scaled_rotation::{ScaledCamera, camera_of_row, note_on_scales};
-use crate::skip_report::plural;
 use crate::sources::photos::image_folder::images_in;
 use crate::sources::photos::photo::{MAX_FRAMES, NO_IMAGE, Photo, PhotoScene, unusable};
 

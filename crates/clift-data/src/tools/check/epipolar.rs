@@ -3,10 +3,9 @@
 
 use std::fmt;
 
-use clift_core::{Camera, IntrinsicsNorm, median};
+use clift_core::{Camera, IntrinsicsNorm, median, plural};
 use glam::{DMat3, DVec3};
 
-use crate::skip_report::plural;
 use crate::tools::check::frames::{
     exchange_neighbours, find_triplets, frame_distances, triplet_distances, wrong_frames,
 };

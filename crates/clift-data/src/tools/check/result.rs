@@ -1,8 +1,7 @@
 //! Results of the check of one scene.
 
+use clift_core::plural;
 use serde::{Deserialize, Serialize};
-
-use crate::skip_report::plural;
 
 /// Median symmetric epipolar distance above which a scene is flagged, in pixels of an image 640 columns wide.
 pub const MAX_EPIPOLAR_PX: f64 = 1.0;

@@ -2,8 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use clift_core::plural;
+
 use crate::scene_source::SceneSource;
-use crate::skip_report::{SkipReport, plural};
+use crate::skip_report::SkipReport;
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::check::{cameras, epipolar, images};

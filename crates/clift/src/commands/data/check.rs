@@ -1,6 +1,7 @@
 //! `clift data check`.
 
-use clift_data::{SceneCheck, Split, Verdict, check_scene, note_skipped_frames, plural, skipped_scenes};
+use clift_core::plural;
+use clift_data::{SceneCheck, Split, Verdict, check_scene, note_skipped_frames, skipped_scenes};
 use clift_eval::table;
 use serde::Serialize;
 

@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
+use clift_core::plural;
+use clift_data::{OverlapOptions, SceneSource, write_overlap_index};
 
 use crate::commands::args::parse::{parse_distance, parse_output};
 use crate::commands::args::splits::{SourceArgs, Splits};

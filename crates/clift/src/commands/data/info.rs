@@ -4,9 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use clift_data::{
-    DataError, DatasetRoot, OpenedSource, SkipReport, SkippedScene, SourceInfo, SourceKind, open_source, plural,
-};
+use clift_core::plural;
+use clift_data::{DataError, DatasetRoot, OpenedSource, SkipReport, SkippedScene, SourceInfo, SourceKind, open_source};
 use serde::Serialize;
 
 use crate::commands::args::shared_args::JsonArg;

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail};
-use clift_core::{TEMPORARY, make_folder, publish_folder, remove_leftovers, replace_file};
-use clift_data::{image_size, plural};
+use clift_core::{TEMPORARY, make_folder, plural, publish_folder, remove_leftovers, replace_file};
+use clift_data::image_size;
 use serde::{Deserialize, Serialize};
 
 use crate::commands::args::shared_args::JsonArg;

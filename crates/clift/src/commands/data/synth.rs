@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
-use clift_core::{TEMPORARY, publish_folder};
-use clift_data::{Split, SyntheticConfig, SyntheticSource, plural, read_scene, write_chunks, write_evaluation_index};
+use clift_core::{TEMPORARY, plural, publish_folder};
+use clift_data::{Split, SyntheticConfig, SyntheticSource, read_scene, write_chunks, write_evaluation_index};
 use clift_eval::EvalConfig;
 use clift_train::parse_config;
 
