@@ -62,7 +62,7 @@ fn update<V: Size>(
 pub fn adamw(client: &Client, settings: AdamW, inputs: [&Buffer; 3], grad: &Buffer) -> [Buffer; 3] {
     let outputs = inputs.map(|input| Buffer::empty(client, input.len, Values::F32));
     let ([parameter, mean, square], [new_parameter, new_mean, new_square]) = (inputs, &outputs);
-    let (vector, count) = elementwise(grad.len);
+    let (vector, count, dim) = elementwise(grad.len);
     let AdamW { learning_rate, weight_decay, beta_1, beta_2, correction_1, correction_2, epsilon, grad_factor } =
         settings;
     // SAFETY: the kernel compares its index with the length.
@@ -70,7 +70,7 @@ pub fn adamw(client: &Client, settings: AdamW, inputs: [&Buffer; 3], grad: &Buff
         update::launch_unchecked(
             client,
             count,
-            CubeDim::new_1d(UNITS as u32),
+            dim,
             vector,
             parameter.arg(vector),
             mean.arg(vector),

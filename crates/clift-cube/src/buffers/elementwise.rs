@@ -8,10 +8,10 @@ use crate::buffers::buffer::{Buffer, Values};
 /// Units of a cube.
 pub(crate) const UNITS: usize = 256;
 
-/// Returns the width of vectors and the count of cubes of an elementwise kernel.
-pub(crate) fn elementwise(len: usize) -> (usize, CubeCount) {
+/// Returns the width of vectors, the count of cubes and their size for an elementwise kernel.
+pub(crate) fn elementwise(len: usize) -> (usize, CubeCount, CubeDim) {
     let vector = if len.is_multiple_of(4) { 4 } else { 1 };
-    (vector, cube_count((len / vector).div_ceil(UNITS)))
+    (vector, cube_count((len / vector).div_ceil(UNITS)), CubeDim::new_1d(UNITS as u32))
 }
 
 /// Returns a count of at least `cubes` cubes in two dimensions, each within the limit of adapters (65,535).
@@ -37,19 +37,11 @@ pub fn cast(client: &Client, x: &Buffer, values: Values) -> Buffer {
         return x.clone();
     }
     let output = Buffer::empty(client, x.len, values);
-    let (vector, count) = elementwise(x.len);
+    let (vector, count, dim) = elementwise(x.len);
     let types = [x.values.elem(), values.elem()];
     // SAFETY: the kernel compares its index with the length.
     unsafe {
-        copy::launch_unchecked(
-            client,
-            count,
-            CubeDim::new_1d(UNITS as u32),
-            vector,
-            x.arg(vector),
-            output.arg(vector),
-            types,
-        );
+        copy::launch_unchecked(client, count, dim, vector, x.arg(vector), output.arg(vector), types);
     }
     output
 }

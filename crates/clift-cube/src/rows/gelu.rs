@@ -4,7 +4,7 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
 use crate::buffers::buffer::{Buffer, Values};
-use crate::buffers::elementwise::{UNITS, elementwise};
+use crate::buffers::elementwise::elementwise;
 
 /// Returns `exp(-x^2 / 2)`.
 #[cube]
@@ -77,19 +77,11 @@ fn backward<X: Float, V: Size>(
 /// Computes `x Phi(x)` with the normal distribution function `Phi`, in type `output`.
 pub fn gelu_forward(client: &Client, x: &Buffer, output: Values) -> Buffer {
     let output = Buffer::empty(client, x.len, output);
-    let (vector, count) = elementwise(x.len);
+    let (vector, count, dim) = elementwise(x.len);
     let types = [x.values.elem(), output.values.elem()];
     // SAFETY: the kernel compares its index with the length.
     unsafe {
-        forward::launch_unchecked(
-            client,
-            count,
-            CubeDim::new_1d(UNITS as u32),
-            vector,
-            x.arg(vector),
-            output.arg(vector),
-            types,
-        );
+        forward::launch_unchecked(client, count, dim, vector, x.arg(vector), output.arg(vector), types);
     }
     output
 }
@@ -97,13 +89,13 @@ pub fn gelu_forward(client: &Client, x: &Buffer, output: Values) -> Buffer {
 /// Computes `grad (Phi(x) + x phi(x))` with the normal density `phi`, in f32.
 pub fn gelu_backward(client: &Client, x: &Buffer, grad: &Buffer) -> Buffer {
     let grad_x = Buffer::empty(client, x.len, Values::F32);
-    let (vector, count) = elementwise(x.len);
+    let (vector, count, dim) = elementwise(x.len);
     // SAFETY: the kernel compares its index with the length.
     unsafe {
         backward::launch_unchecked(
             client,
             count,
-            CubeDim::new_1d(UNITS as u32),
+            dim,
             vector,
             x.arg(vector),
             grad.arg(vector),
