@@ -89,7 +89,7 @@ pub(crate) fn pack_transposed<'a, S: Simd, O: Operands>(
             for start in (0..lanes).step_by(S::LANES) {
                 // By a loop: the closure of `map` is compiled without the instruction set, a call per vector.
                 let mut packed = [simd.splat(0.0); MAX_LANES];
-                for (packed, row) in packed.iter_mut().zip(block) {
+                for (packed, row) in packed.iter_mut().zip(block).take(S::LANES) {
                     *packed = O::along(simd, row, start);
                 }
                 simd.transpose(&mut packed);

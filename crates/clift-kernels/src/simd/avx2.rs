@@ -1,7 +1,7 @@
 //! AVX2 and FMA vectors.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx2` proves that the processor has AVX2 and FMA")]
 
-use crate::simd::vector::{Simd, binary_intrinsics};
+use crate::simd::vector::{MAX_LANES, Simd, binary_intrinsics};
 
 #[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
@@ -76,5 +76,27 @@ impl Simd for Avx2 {
             let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
             _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
         }
+    }
+    #[inline(always)]
+    fn transpose(self, rows: &mut [__m256; MAX_LANES]) {
+        unsafe {
+            for row in [0, 2, 4, 6] {
+                let (a, b) = (rows[row], rows[row + 1]);
+                rows[row] = _mm256_unpacklo_ps(a, b);
+                rows[row + 1] = _mm256_unpackhi_ps(a, b);
+            }
+            for row in [0, 1, 4, 5] {
+                let (a, b) = (_mm256_castps_pd(rows[row]), _mm256_castps_pd(rows[row + 2]));
+                rows[row] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, b));
+                rows[row + 2] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, b));
+            }
+            for row in [0, 1, 2, 3] {
+                let (a, b) = (rows[row], rows[row + 4]);
+                rows[row] = _mm256_permute2f128_ps::<0x20>(a, b);
+                rows[row + 4] = _mm256_permute2f128_ps::<0x31>(a, b);
+            }
+        }
+        rows.swap(1, 2);
+        rows.swap(5, 6);
     }
 }

@@ -113,29 +113,22 @@ impl InstructionSet {
 
     fn run_with<O: Operands>(self, kernel: impl Kernel) {
         assert!(self.is_available(), "this processor lacks {}", self.name());
-        match self {
-            Self::Portable => kernel.run::<_, O>(Portable),
-            // SAFETY: checked above.
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => unsafe { run_avx2::<O>(kernel) },
-            // SAFETY: checked above.
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => unsafe { run_avx512::<O>(kernel) },
-            // SAFETY: checked above.
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512Bf16 => unsafe { run_avx512_bf16::<false, O>(kernel) },
-            // SAFETY: checked above.
-            #[cfg(target_arch = "x86_64")]
-            Self::Amx if O::PER_LANE == 1 => unsafe { run_avx512_bf16::<false, O>(kernel) },
-            // SAFETY: checked above.
-            #[cfg(target_arch = "x86_64")]
-            Self::Amx => unsafe {
-                let _tiles = Tiles::configure();
-                run_avx512_bf16::<true, O>(kernel);
-            },
-            #[cfg(not(target_arch = "x86_64"))]
-            Self::Avx2 | Self::Avx512 | Self::Avx512Bf16 | Self::Amx => unreachable!("not available"),
+        // SAFETY: checked above.
+        #[cfg(target_arch = "x86_64")]
+        unsafe {
+            match self {
+                Self::Portable => kernel.run::<_, O>(Portable),
+                Self::Avx2 => run_avx2::<O>(kernel),
+                Self::Avx512 => run_avx512::<O>(kernel),
+                Self::Amx if O::PER_LANE > 1 => {
+                    let _tiles = Tiles::configure();
+                    run_avx512_bf16::<true, O>(kernel);
+                }
+                Self::Avx512Bf16 | Self::Amx => run_avx512_bf16::<false, O>(kernel),
+            }
         }
+        #[cfg(not(target_arch = "x86_64"))]
+        kernel.run::<_, O>(Portable);
     }
 }
 
