@@ -13,42 +13,24 @@ use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, st
 use crate::viewer::tab::Viewer;
 
 /// Words of the documents, and those for small data.
-const SMALLER: [(&str, &str); 5] = [
+const SMALLER: [(&str, &str); 6] = [
     (" /data/", " data/"),
     ("--scene KEY", "--scene 00000000000000b1"),
     ("--distance 45..135", "--distance 6..7"),
     ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
     ("--stored-tokens 256", "--stored-tokens 2"),
+    ("--preset patchwise", "--preset patchwise --stored-tokens 1/2"),
 ];
 
 /// Keys of a config whose training takes a second on six frames.
-const SMALL_RUN: [&str; 25] = [
-    "run_dir=trained",
-    "data.width=16",
-    "data.height=16",
-    "data.synthetic.num_scenes=4",
-    "data.filters.min_frames=6",
-    "data.views={min_context=2, max_context=2, min_gap=[3, 3], max_gap=[5, 5], warm_up_steps=0, num_targets=2}",
-    "model.dim=16",
-    "model.num_heads=2",
-    "model.feed_forward_dim=24",
-    "model.num_encoder_blocks=1",
-    "model.num_renderer_blocks=1",
-    "clusters.grid=[0.5]",
-    "clusters.num_scenes=2",
-    "clusters.num_passes=1",
-    "stage1.further_sizes=[]",
-    "stage1.batch_size=2",
-    "stage1.accumulate=1",
-    "stage2.batch_size=2",
-    "stage2.accumulate=1",
-    "eval.stored_tokens=[0.5]",
-    "eval.validation_stored_tokens=0.5",
-    "eval.num_scenes=1",
-    "eval.num_context=2",
-    "eval.num_targets=2",
-    "eval.every=0",
-];
+const SMALL_RUN: &str = "\
+    run_dir=trained; data.width=16; data.height=16; data.synthetic.num_scenes=4; data.filters.min_frames=6; \
+    data.views={min_context=2, max_context=2, min_gap=[3, 3], max_gap=[5, 5], warm_up_steps=0, num_targets=2}; \
+    model.dim=16; model.num_heads=2; model.feed_forward_dim=24; model.num_encoder_blocks=1; \
+    model.num_renderer_blocks=1; clusters.grid=[0.5]; clusters.num_scenes=2; clusters.num_passes=1; \
+    stage1.further_sizes=[]; stage1.batch_size=2; stage1.accumulate=1; stage2.batch_size=2; stage2.accumulate=1; \
+    eval.stored_tokens=[0.5]; eval.validation_stored_tokens=0.5; eval.num_scenes=1; eval.num_context=2; \
+    eval.num_targets=2; eval.every=0";
 
 /// The same as a layout of two views, for the micro run.
 const SMALL_DATA: &str = "data={source='auto', root='PATH', width=16, height=16, views={min_context=2, max_context=2, \
@@ -187,16 +169,17 @@ fn shrink(args: &mut Vec<String>) {
         Some(at) => value.clone_into(&mut args[at + 1]),
         None => args.extend([flag.to_owned(), value.to_owned()]),
     };
+    let small_run: Vec<_> = SMALL_RUN.split("; ").collect();
     match (command.as_str(), args.get(1).map(String::as_str)) {
         ("train", _) => {
             default(args, "--device", "flex");
             // Each of several configs keeps its own `run_dir`, the first key.
             let several = args.iter().filter(|arg| arg.starts_with("configs/")).count() > 1;
             args.extend(several.then(|| "--fresh".to_owned()));
-            set(args, &SMALL_RUN[usize::from(several)..]);
+            set(args, &small_run[usize::from(several)..]);
             set(args, &["loss.perceptual_weight=0", "stage1.steps=1", "stage2.steps=1"]);
         }
-        ("plan", _) => set(args, &SMALL_RUN),
+        ("plan", _) => set(args, &small_run),
         ("eval", _) if args.iter().any(|arg| arg == "--checkpoint") => {
             set(args, &["data.width=24", "data.height=16"]);
         }
@@ -273,6 +256,8 @@ fn prepare(base: &Path) {
         clift(&["train", config.as_str()].into_iter().chain(sets).collect::<Vec<_>>());
     };
     train(&["run_dir=runs/tiny", "eval.formats=['f32', 'f16']"]);
+    let tiles = ["run_dir=runs/tiny-tiles", "clusters.grouping='tile'", "eval.validation_stored_tokens=0.5"];
+    train(&[&tiles[..], &["stage1={init_from='runs/tiny', steps=0}"]].concat());
     train(&["run_dir=runs/re10k", SMALL_DATA]);
     // An example replaces PATH.
     train(&["run_dir=runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR")]);
@@ -283,10 +268,11 @@ fn prepare(base: &Path) {
     }
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
     take_small_images(base, &["-o".into(), "models/re10k".into()]);
-    let mut rooms = ["train", "configs/rooms-64.toml", "configs/rooms.toml"].map(str::to_owned).to_vec();
+    let rooms = ["train", "configs/rooms-64.toml", "configs/rooms-128.toml", "configs/rooms.toml"];
+    let mut rooms = rooms.map(str::to_owned).to_vec();
     shrink(&mut rooms);
     clift(&rooms.iter().map(String::as_str).collect::<Vec<_>>());
-    for (from, to) in [("tiny", "a"), ("tiny", "b"), ("rooms", "capture"), ("rooms", "attic")] {
+    for (from, to) in [("tiny", "a"), ("tiny", "b"), ("tiny", "tiny-570"), ("rooms", "capture"), ("rooms", "attic")] {
         copy(&base.join("runs").join(from), &format!("runs/{to}"));
     }
     clift(&["export", "runs/rooms", "-o", "models/rooms"]);
