@@ -69,8 +69,8 @@ Examples:
     Flops(FlopsArgs),
     /// Compress posed images into a scene file
     ///
-    /// Selects context views along the camera path, encodes them and compresses the tokens to the requested count. The
-    /// file contains everything for rendering except the weights.
+    /// Encodes context views (photos in groups of neighbours) and compresses their tokens to the requested count. The file
+    /// contains everything for rendering except the weights.
     #[command(after_help = "\
 Examples:
   clift encode captures/attic -o attic.clift

@@ -97,7 +97,7 @@ pub struct EvalArgs {
     /// Run directory
     #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint", value_parser = parse_run)]
     pub run: Option<PathBuf>,
-    /// Evaluate a model directory (from `clift import`) instead of a run
+    /// Evaluate a model directory, a stage of a run or a weight file instead of a run
     #[arg(long, value_name = "MODEL", requires = "data")]
     pub checkpoint: Option<PathBuf>,
     /// Data set, for --checkpoint or for a run whose data has moved
@@ -108,9 +108,10 @@ pub struct EvalArgs {
     pub stage1: Option<PathBuf>,
     /// Run an experiment of the paper: main, ablation, patchwise or budget
     ///
-    /// Sets the methods, --stored-tokens, --render and --selection; options of the command line take precedence. main: quality
-    /// against data size. ablation: random tokens, K-means, K-means with condenser. patchwise: tiles of the views against
-    /// K-means, with and without condenser; needs --with. budget: half of the tokens stored, decreasing rendered counts.
+    /// Sets the methods, --stored-tokens, --render, --selection and --format; options of the command line take precedence.
+    /// main: quality against data size. ablation: random tokens, K-means, K-means with condenser. patchwise: tiles of the
+    /// views against K-means, with and without condenser; needs --with. budget: half of the tokens stored, decreasing
+    /// rendered counts.
     #[arg(long, value_name = "NAME", value_parser = |name: &str| parse_value::<Experiment>("preset", name))]
     pub preset: Option<Experiment>,
     /// Add a run of LVSM, or one of this stage 1 and another clusters.grouping
