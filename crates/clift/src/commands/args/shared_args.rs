@@ -10,19 +10,16 @@ use crate::commands::args::parse::parse_output;
 use crate::output::output_file::OutputFile;
 use crate::output::stdout::{print_note, print_result};
 
+macro_rules! shipped_configs {
+    ($($name:literal)*) => {
+        &[$((concat!("configs/", $name), include_str!(concat!("../../../../../configs/", $name)))),*]
+    };
+}
+
 /// Configs inside the program, by the paths that they have in the repository.
-const CONFIGS: [(&str, &str); 11] = [
-    ("configs/capture.toml", include_str!("../../../../../configs/capture.toml")),
-    ("configs/dl3dv.toml", include_str!("../../../../../configs/dl3dv.toml")),
-    ("configs/lvsm-ed-re10k.toml", include_str!("../../../../../configs/lvsm-ed-re10k.toml")),
-    ("configs/lvsm-ed-synthetic.toml", include_str!("../../../../../configs/lvsm-ed-synthetic.toml")),
-    ("configs/lvsm-ed-tiny.toml", include_str!("../../../../../configs/lvsm-ed-tiny.toml")),
-    ("configs/re10k-small.toml", include_str!("../../../../../configs/re10k-small.toml")),
-    ("configs/re10k.toml", include_str!("../../../../../configs/re10k.toml")),
-    ("configs/rooms-64.toml", include_str!("../../../../../configs/rooms-64.toml")),
-    ("configs/rooms.toml", include_str!("../../../../../configs/rooms.toml")),
-    ("configs/synthetic.toml", include_str!("../../../../../configs/synthetic.toml")),
-    ("configs/tiny.toml", include_str!("../../../../../configs/tiny.toml")),
+const CONFIGS: &[(&str, &str)] = shipped_configs![
+    "capture.toml" "dl3dv.toml" "lvsm-ed-re10k.toml" "lvsm-ed-synthetic.toml" "lvsm-ed-tiny.toml" "re10k-small.toml"
+    "re10k.toml" "rooms-128.toml" "rooms-64.toml" "rooms.toml" "synthetic.toml" "tiny.toml"
 ];
 
 /// Options that override keys of a config.
