@@ -238,8 +238,8 @@ fn by_key<'v, S: Simd, O: Operands>(
     Left { values, row: 1, step: stride }
 }
 
-/// Replaces rows of scores, `width` values every `stride`, by the weights `P`, and the weights' gradients by the scores'
-/// gradients. `log_sums` and `deltas` have a value per row.
+/// Replaces rows of scores, whole vectors of `width` values every `stride`, by the weights `P`, and the weights' gradients by
+/// the scores' gradients. `log_sums` and `deltas` have a value per row.
 #[inline(always)]
 fn score_gradients<S: Simd, O: Operands>(
     simd: S,
@@ -248,14 +248,19 @@ fn score_gradients<S: Simd, O: Operands>(
     scale: f32,
     (log_sums, deltas): (&[f32], &[f32]),
 ) {
+    assert!(width.is_multiple_of(S::LANES), "whole vectors");
     let rows = scores.chunks_mut(stride).zip(slopes.chunks_mut(stride));
     for ((scores, slopes), (&log_sum, &delta)) in rows.zip(log_sums.iter().zip(deltas)) {
         let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
-        let vectors = scores[..width].chunks_exact_mut(S::LANES).zip(slopes[..width].chunks_exact_mut(S::LANES));
-        for (score, slope) in vectors {
-            let weight = O::exp2(simd, simd.mul_add(simd.read(score), factor, shift));
-            simd.write(score, weight);
-            simd.write(slope, simd.mul(weight, simd.sub(simd.read(slope), delta)));
+        let (scores, slopes) = (scores[..width].as_mut_ptr(), slopes[..width].as_mut_ptr());
+        for start in (0..width).step_by(S::LANES) {
+            // SAFETY: `width` is a multiple of `LANES`. Slower by slices: their length is read in every iteration.
+            unsafe {
+                let (score, slope) = (scores.add(start), slopes.add(start));
+                let weight = O::exp2(simd, simd.mul_add(simd.load(score), factor, shift));
+                simd.store(score, weight);
+                simd.store(slope, simd.mul(weight, simd.sub(simd.load(slope), delta)));
+            }
         }
     }
 }
