@@ -122,7 +122,7 @@ impl Fixture {
         self.data(name).shape().to_vec()
     }
 
-    fn data(&self, name: &str) -> TensorData {
+    pub fn data(&self, name: &str) -> TensorData {
         let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
         let view = file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
         let dtype = match view.dtype() {

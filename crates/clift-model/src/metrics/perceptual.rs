@@ -104,7 +104,7 @@ mod tests {
     /// Checks loss and gradient. Rounding can flip the sign of a difference near zero, and change an entry of the
     /// gradient. In f32 its tolerance is therefore relative to the largest entry.
     fn check_fixture(loss: &Perceptual, fixture: &Fixture, options: (&Device, DType), tolerances: [f64; 2]) {
-        let tensor = |name: &str| fixture.tensor_f64::<5>(name, options.0).cast(options.1);
+        let tensor = |name: &str| Tensor::from_data(fixture.data(name), options);
         let (loss, grad) = loss_and_grad(loss, tensor("input.rendering"), tensor("input.target"));
         let (expected, expected_grad) = (fixture.f64s("output.loss")[0], fixture.f64s("grad.input.rendering"));
         assert!((loss - expected).abs() <= tolerances[0] * expected, "{loss} is not {expected}");
