@@ -55,7 +55,11 @@ fn errors_of_transforms_json_are_named() {
         ("\"fl_x\": 28.0", "\"fl_x\": NaN", "number out of range"),
         ("\"w\": 32", "\"w\": 0", "w is 0, expected a number of pixels"),
         ("\"OPENCV\"", "\"EQUIRECTANGULAR\"", "camera_model is EQUIRECTANGULAR, expected one of OPENCV, PINHOLE, "),
-        ("\"fl_x\"", "\"distortion_params\": [0.1], \"fl_x\"", "distortion_params has 1 numbers, expected 4 or 6 for"),
+        (
+            "\"fl_x\"",
+            "\"distortion_params\": [0.1], \"fl_x\"",
+            "distortion_params has 1 numbers, expected 4 or 6 for OPENCV",
+        ),
         ("\"fl_x\"", "\"k1\": -9.5, \"fl_x\"", "cannot be undone at the edge of the image"),
         ("[[0.", "[[7.", "whose camera cannot be used: bad camera: the rotation is off an orthonormal one by"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0, 1.0]", "transform_matrix ends in [0.0, 0.0, 1.0, 1.0]"),
