@@ -83,7 +83,7 @@ pub fn encode(
 }
 
 /// Returns the share of the tokens that is stored by default: a quarter of one group or half of several. Of many tokens, `MOST`
-/// are stored, which `models/rooms` codes in about 380 kB, or an eighth if that is more.
+/// are stored, which `models/rooms` codes in about 360 kB, or an eighth if that is more.
 fn default_share(num_tokens: usize, num_groups: usize) -> f64 {
     const MOST: f64 = 7168.0;
     (MOST / num_tokens as f64).clamp(0.125, if num_groups == 1 { 0.25 } else { 0.5 })
